@@ -9,7 +9,7 @@ import pytest
 
 from hmsa_lab.adapt import adaptive_joint, corrections, estimator, window
 from hmsa_lab.adapt.motion import follow
-from hmsa_ros.runtime.records import Trajectory
+from hmsa_ros.runtime.records import Severity, Trajectory
 
 MOVES = (1.4, 1.1, 1.4, 1.1, 1.4)
 
@@ -192,7 +192,67 @@ def test_a_fault_after_a_healthy_move_leaves_what_that_move_confirmed():
     moves(it, MOVES[:2])
     it.sense = lambda time, x: [(time, x + 0.05)]
     assert np.max(np.abs(moves(it))) < 0.5
-    assert 'with the parameters that samples confirmed last' in it.message
+    assert 'G about +10 %, bias of the sensor about 0.05; plans use it' in it.message
+    assert 'plans keep the parameters that samples confirmed last' in it.message
+
+
+def drifting():
+    begun = []
+
+    def sense(time, stretch):
+        begun.append(time)
+        return [(time, stretch + 1e-2 * (time - begun[0]) / 1e9)]
+    return sense
+
+
+CHANGES = {
+    'scale 0.9': lambda: lambda time, x: [(time, 1.0 + 0.9 * (x - 1.0))],
+    'scale 0.98': lambda: lambda time, x: [(time, 1.0 + 0.98 * (x - 1.0))],
+    'drift 1 % a second': drifting}
+
+
+@pytest.mark.parametrize('change', CHANGES)
+@pytest.mark.parametrize('modulus', [1.0, 1.1])
+def test_a_sensor_that_changes_is_named_costs_nothing_and_is_forgotten(change, modulus):
+    it = bench(False, noise=1e-3, factors={'shear_modulus': modulus})
+    moves(it, (1.3, 1.15, 1.4))
+    healthy, it.sense = it.sense, CHANGES[change]()
+    first = len(it.estimates)
+    assert np.max(np.abs(moves(it, (1.2, 1.35, 1.1)))) < 1.0
+    assert any('the sensor has changed' in x.message and x.severity is Severity.WARN
+               for x in it.estimates[first:])
+    it.sense = healthy
+    assert np.max(np.abs(moves(it, (1.3, 1.15, 1.4, 1.2)))) < 0.5
+    assert 'sensor has changed' not in it.message
+
+
+@pytest.mark.parametrize('modulus', [1.0, 1.1])
+def test_a_small_bias_that_jumps_and_stays_costs_nothing(modulus):
+    it = bench(False, noise=1e-3, factors={'shear_modulus': modulus})
+    moves(it, (1.3, 1.15, 1.4))
+    it.sense = lambda time, x: [(time, x + 0.002)]
+    assert np.max(np.abs(moves(it, (1.2, 1.35, 1.1, 1.3, 1.15, 1.4)))) < 0.5
+
+
+def test_what_a_sensor_showed_that_was_wrong_from_the_first_sample_ends_with_it():
+    it = bench(False, noise=1e-3)
+    healthy, it.sense = it.sense, CHANGES['scale 0.9']()
+    # Samples cannot tell its scale from another remanence.
+    assert np.max(np.abs(moves(it, (1.3, 1.15))[:, 1])) > 5.0
+    it.sense = healthy
+    assert np.max(np.abs(moves(it, (1.35, 1.2, 1.3)))) < 2.0
+    assert it.planner.model.actuator.remanence == pytest.approx(
+        it.runtime.follower.joints['a'].given.actuator.remanence, rel=1e-3)
+
+
+def test_a_request_tries_again_what_saturated_an_amplifier():
+    it = bench(False, plant={'limit': 0.06})
+    it.move(1.4, 400 * MS)
+    joint = it.runtime.follower.joints['a']
+    assert joint.largest == pytest.approx(0.06)
+    it.plant.limit = math.inf
+    it.move(1.35, 100 * MS)
+    assert joint.largest == math.inf
 
 
 # -- time ----------------------------------------------------------------------------------------

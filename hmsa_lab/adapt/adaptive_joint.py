@@ -5,6 +5,8 @@ from dataclasses import dataclass, field, InitVar, replace
 from functools import partial
 import math
 
+import numpy as np
+
 from hmsa.errors import HmsaError
 from hmsa.identification.known import Known
 from hmsa.judge.records import SensorModel
@@ -16,8 +18,16 @@ from hmsa.planning.planner import Believed, Planner
 from hmsa.planning.timeline import JointModel, Timeline
 from hmsa_lab.adapt.choice import clearly_better
 from hmsa_lab.adapt.estimator import Estimator, EstimatorOptions, StateEstimate
-from hmsa_lab.adapt.learnt import as_of_path, differs, initial_state, learnt_model, sensor_of
-from hmsa_lab.adapt.messages import sentence
+from hmsa_lab.adapt.learnt import (
+    as_of_path,
+    differs,
+    excludes,
+    initial_state,
+    learnt_model,
+    same_parameters,
+    sensor_of,
+)
+from hmsa_lab.adapt.messages import differences, sentence
 from hmsa_lab.adapt.motion import held, rest
 from hmsa_lab.adapt.move_errors import MoveErrors, Moves
 from hmsa_lab.adapt.prior import Prior
@@ -46,6 +56,11 @@ _LOOK = 3.0
 # time scales and coil time constants, after a change or in all. A field that is measured some ms
 # before or after the stretch differs for that long at each change of level.
 _OFF, _LEAST, _FOLLOWED = 0.05, 0.01, 3.0
+# A sensor that had changed is as before again once its gain is known to better than this, and
+# differs by less plus half a standard deviation; its bias by less plus some standard deviations.
+_AGAIN, _ALIKE, _BIAS, _SURE = 8e-3, 2e-3, 2e-4, 3.0
+# Log odds from which the sensor counts as changed.
+_JUMPED = 5.0
 # Fraction by which the report of an applied level may be rounded.
 _ROUNDED = 0.01
 
@@ -59,6 +74,7 @@ class AdaptiveJoint:
     given: JointModel
     settings: Settings
     begun: InitVar[int]
+    prior: Prior = field(init=False)  # of the given parameters
     estimator: Estimator = field(init=False)
     trust: Trust = field(init=False)
     start: float = field(init=False)  # stretch before the setpoint under way
@@ -95,23 +111,37 @@ class AdaptiveJoint:
     _sensor: tuple[StateEstimate, SensorModel] | None = None  # estimate, and its sensor
     _measured: bool = False  # whether the field is measured
     _differs: int | None = None  # timestamp since which the field differs; None if it does not
+    sensor_changed: bool = False  # whether the estimator allows for any bias and gain
+    reverts: bool = False  # whether the plan is to be reverted to the given parameters
+    _bias: tuple[float, float] = 0.0, 0.0  # of the sensor as confirmed, and its deviation
+    _as_given_tried: bool = False  # whether it last restarted with the sensor as given
     mismatch: int = 0  # longest time in ns for which it differed, and then not any more
 
     def __post_init__(self, begun: int) -> None:
         given, settings = self.given, self.settings
-        prior = Prior.nominal(
-            given.actuator, settings.feedback_parameters, suspects=True, others=given.others)
-        self.estimator = Estimator(
-            prior.informed(settings.known.get(self.name, Known())),
-            EstimatorOptions(
-                slew_limit=given.options.slew_limit, learn=not settings.feedback_frozen))
+        self.prior = self._as_identified(given)
+        place = self.prior.free.index('stretch_bias') if 'stretch_bias' in self.prior.free else -1
+        self._bias = self.prior.values['stretch_bias'], math.sqrt(
+            self.prior.covariance[place, place]) if place >= 0 else 0.0
+        self.estimator = Estimator(self.prior, EstimatorOptions(
+            slew_limit=given.options.slew_limit, learn=not settings.feedback_frozen))
         self.trust = Trust(begun, at_once=settings.cautious)
         self.start = given.actuator.rest
 
     @property
+    def _known(self) -> Known:
+        return self.settings.known.get(self.name, Known())
+
+    def _as_identified(self, model: JointModel) -> Prior:
+        """Return the prior of a model and a sensor as given."""
+        return Prior.nominal(
+            model.actuator, self.settings.feedback_parameters, suspects=True,
+            others=model.others).informed(self._known)
+
+    @property
     def unit(self) -> float:
         """Given time scale in s."""
-        return float(self.estimator.prior.values['time_unit'])
+        return float(self.prior.values['time_unit'])
 
     @property
     def adapts(self) -> bool:
@@ -164,7 +194,7 @@ class AdaptiveJoint:
         lost = self.lost = self._off(stamp, flux_density)
         if lost and self.trust.why != lost and self.trust.doubt(lost, now, at_once=True):
             # The estimate is discarded, and the update under way ends.
-            self.estimator.restart()
+            self._restart()
             self.latest, self.news = None, True
             self.looked()
         sample = stamp, math.nan if lost else stretch, now
@@ -241,17 +271,97 @@ class AdaptiveJoint:
         screening, trust = estimator.screening, self.trust
         self._note_start(plan, now)
         trouble = screening.trouble if found is None else found.trouble
+        if found is not None and not trouble and found.jumped > _JUMPED:
+            trouble = 'samples fit better if the sensor has changed since the move before'
         if screening.lost > before and not trust.acts:
             # Later samples of the same update have fitted again.
             trouble = trouble or screening.last_trouble
+        acted = trust.acts
         if trust.doubt(trouble, now) if trouble else found is not None and trust.fits(
                 plan, self.unit, self.estimator, now):
-            self.estimator.restart()
+            self._restart()
+        elif found is not None and trust.acts and trust.failed:
+            self._look_at_sensor(found, now, anew=not acted)
         if found is not None and not trust.why:
             self._look_at_vibration(plan, found)
         if found is not None and trust.why:
             found = replace(found, trusted=False, trouble=trust.why)
         self.latest, self.news = found, True
+
+    def _restart(self, *, healthy: bool = False) -> None:
+        """
+        Restart the estimator, in turn with the sensor as given and with one that has changed.
+
+        The former decides whether samples show the actuator as given. If not, the actuator stays
+        as samples confirmed it before, and a change of the sensor explains what it can. If
+        ``healthy``, the sensor is as given, and the actuator as confirmed.
+        """
+        model = self.trust.confirmed or self.given
+        changed = self.trust.failed and not self.sensor_changed and (
+            self._as_given_tried or not self._learnt)
+        self._as_given_tried = not changed
+        self.sensor_changed = changed and not healthy
+        self.estimator.restart(
+            self._as_identified(model) if healthy else
+            self.prior if not changed else Prior.of_changed_sensor(
+                model.actuator, self.settings.feedback_parameters, self._known,
+                others=model.others))
+        self.trust.restarted(self.estimator.screening.rejected)
+
+    def _look_at_sensor(self, found: StateEstimate, now: int, *, anew: bool) -> None:
+        """Decide whether the sensor has changed, after an estimate that failed; ``anew``: fits."""
+        trust = self.trust
+        if not self.sensor_changed:
+            if not differences(found, self.prior.values) and (
+                    excludes(found, trust.confirmed)
+                    if trust.confirmed is not None and self._learnt else self._is_bias(
+                        found.values['stretch_bias'],
+                        found.deviations.get('stretch_bias', 0.0))):
+                # Samples need neither what was learnt nor another sensor.
+                trust.recover(given=True)
+                self.used = self.given
+                self.reverts = not same_parameters(self.given, self.planner.model)
+                self.planner.take_model(self.given)
+            elif anew:
+                trust.wait(now)
+                self._restart()
+        elif self._measures_as_before(found):
+            trust.recover(given=False)
+            # With that sensor, samples have confirmed what plans use.
+            trust.confirmed = self.planner.model
+            self._restart(healthy=True)
+            trust.wait(now)
+
+    def _measures_as_before(self, found: StateEstimate) -> bool:
+        """Return whether gain and bias about rest of a sensor are as before a change."""
+        gain, bias = (found.free.index(x) for x in ('stretch_gain', 'stretch_bias'))
+        more = found.values['stretch_gain'] - self.prior.values['stretch_gain']
+        deviation = found.deviations['stretch_gain']
+        row = np.zeros(len(found.covariance))
+        row[bias], row[gain] = 1.0, found.values['stretch_gain'] * self.prior.coordinate.rest
+        return deviation < _AGAIN and abs(more) < _ALIKE + 0.5 * deviation and (
+            self._is_bias(found.values['stretch_bias'] + more * self.prior.coordinate.rest,
+                          math.sqrt(row @ found.covariance @ row)))
+
+    @property
+    def _learnt(self) -> bool:
+        """Whether moves have confirmed other than the given parameters."""
+        confirmed = self.trust.confirmed
+        return confirmed is not None and not same_parameters(confirmed, self.given)
+
+    def _is_bias(self, value: float, deviation: float) -> bool:
+        """Return whether a bias with a standard deviation is that which moves confirmed before."""
+        before, known = self._bias
+        return abs(value - before) < _SURE * math.hypot(deviation, known) + _BIAS
+
+    def confirm(self, model: JointModel) -> None:
+        """Record that a move planned with a model has arrived."""
+        if self.sensor_changed:
+            return
+        self.trust.confirm(model, self.ledger.left)
+        found = self.acting
+        if found is not None and not self.trust.failed:
+            self._bias = found.values['stretch_bias'], found.deviations.get('stretch_bias', 0.0)
 
     def looked(self) -> None:
         """End the update under way, and add the samples that arrived during it."""
@@ -401,13 +511,17 @@ class AdaptiveJoint:
         place = plan.under_way(now)
         target = plan.segments[place].stretch if place >= 0 else self.start
         use = 'plans use it' if trust.acts else 'plans use it after a move that samples fit'
-        return sentence(
-            self.latest, self.estimator.prior.values, plan.level(now).flux_density, target,
+        words = sentence(
+            self.latest, self.prior.values, plan.level(now).flux_density, target,
             self.start, self.amplitude, use if self.adapts else '')
+        return words + (
+            '; the sensor has changed, as far as samples tell, and plans keep '
+            f'{trust.parameters}: check the sensor, or ~/reset_estimate to take it as it is'
+            if self.sensor_changed else '')
 
     def figures(self) -> dict[str, object]:
         """Return parameters in SI, with standard deviations and given values, and counters."""
-        prior, screening = self.estimator.prior.values, self.estimator.screening
+        prior, screening = self.prior.values, self.estimator.screening
         found = self.latest
         values: dict[str, object] = {'trusted': found is not None and found.trusted}
         if found is not None:

@@ -89,6 +89,8 @@ class Corrections:
         estimate = joint.foreseen(draft.begin)
         joint.moves = Moves(not same_parameters(draft.levels[-1].model, joint.given))
         joint.next_update = joint.next_sample = joint.waits = 0
+        # An amplifier that saturated may not do so any more.
+        joint.largest = math.inf
         if estimate is None or segment.arrival is None or segment.code in (
                 Code.LEVELS, Code.PATH):
             return draft

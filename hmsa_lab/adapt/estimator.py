@@ -99,6 +99,7 @@ class StateEstimate:
     noise: float  # standard deviation of a sample
     trusted: bool  # whether it may be used for plans
     trouble: str  # reason if not; else empty
+    jumped: float  # log odds that the sensor has changed since the last move
 
     @property
     def actuator(self) -> ActuatorParameters:
@@ -173,8 +174,9 @@ class Estimator:
         self._window: Window | None = None
         self._solution: Solution | None = None
 
-    def restart(self) -> None:
-        """Discard all estimates; counts and levels stay."""
+    def restart(self, prior: Prior) -> None:
+        """Discard all estimates, and begin with a prior; counts and levels stay."""
+        self.prior = prior
         self.screening.restart()
         self._pending.clear()
         self._fixed = self._window = self._solution = None
@@ -380,7 +382,7 @@ class Estimator:
         return StateEstimate(
             time, float(state[-2]), float(state[-1]), values, self.prior.free, deviations,
             covariance, off, found.instead, doubt, window.suspects.gain, self.noise,
-            not trouble, trouble)
+            not trouble, trouble, found.jumped)
 
     def _strange(self, z: Array) -> str:
         """Return a message on implausible parameters that samples would need; else empty."""

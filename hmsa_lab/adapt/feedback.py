@@ -48,7 +48,7 @@ class Feedback(Follower):
         self._corrections = Corrections(self, clock)
         self.corrections = 0  # number of corrected plans
         self._seldom = 1.0  # factor of the delay between updates
-        self._ended: list[AdaptiveJoint] = []  # joints whose plans are to be reverted
+        self._reverted: list[AdaptiveJoint] = []  # joints whose plans are to be reverted
         for name, planner in group.planners.items():
             planner.believed = partial(self._believed, name)
         self._begin({name: x.model for name, x in group.planners.items()})
@@ -231,8 +231,8 @@ class Feedback(Follower):
 
     def _report(self, joint: AdaptiveJoint, now: int) -> None:
         found, mode = joint.latest, self._settings.feedback
-        bad = joint.trust.why or found is not None and mode == 'observe' and differences(
-            found, joint.estimator.prior.values)
+        bad = joint.trust.why or joint.sensor_changed or (
+            found is not None and mode == 'observe' and differences(found, joint.prior.values))
         self._outputs.append(EstimateChanged(
             now, joint.name, Severity.WARN if bad else Severity.OK, joint.words(now),
             {'mode': mode, **joint.figures(),
@@ -257,16 +257,16 @@ class Feedback(Follower):
         plan = joint.planner.plan
         why = yield from joint.ledger.take(hold, plan, joint.given, joint.moves, joint.sensor)
         if not why:
-            joint.trust.confirm(plan.levels[-1].model, joint.ledger.left)
+            joint.confirm(plan.levels[-1].model)
             return
         joint.trust.end(why)
         joint.news, joint.fresh = True, True
-        self._ended.append(joint)
+        self._reverted.append(joint)
         self._report_ended(joint.words(self._clock()))
 
     def taken_back(self) -> list[AdaptiveJoint]:
         """Return joints, once each, whose plans must be reverted to the given parameters."""
-        found, self._ended = self._ended, []
+        found, self._reverted = self._reverted, []
         return found
 
     def news(self) -> Iterator[AdaptiveJoint]:
@@ -275,6 +275,9 @@ class Feedback(Follower):
             if not joint.adapts or not joint.news or joint.choosing is not None:
                 continue
             joint.news = False
+            if joint.reverts:
+                joint.reverts = False
+                self._reverted.append(joint)
             latest = joint.acting
             if latest is None:
                 joint.used = joint.learnt(joint.given)

@@ -175,6 +175,19 @@ class Evidence:
             square + (weight[:, None] * apart).T @ apart,
             likely @ (self._without_gain(found, counts) - found.step[best]))
 
+    def best(self, information: Array | None = None) -> float:
+        """
+        Return the log probability of the most probable set of suspects.
+
+        With the ``information`` of a prior that differs from the one before, by `others`, that of
+        its density counts, too.
+        """
+        found = self._all().evidence
+        if information is not None:
+            found = found + 0.5 * np.linalg.slogdet(_part(information, np.pad(
+                self.suspects.seeking, ((0, 0), (0, 2)), constant_values=True)))[1]
+        return float(np.max(found))
+
     def _without_gain(self, found: Explained, places: NDArray[np.int64]) -> Array:
         """Return the steps for sets of suspects, with other parameters in place of a gain."""
         step, instead = found.step[places], self.suspects.with_gain[places]

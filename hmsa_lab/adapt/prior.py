@@ -44,6 +44,10 @@ SUSPECTS = (
     'viscoelastic_time', 'constant_force', 'stretch_gain')
 # Tracked parameters that may well have their given values.
 _AS_GIVEN = ('shear_modulus', 'damping_coefficient')
+# Deviations of bias and gain of a sensor that may have changed, and parameters that samples of it
+# do not determine, since they change the stretch at rest and hardly the vibration.
+_CHANGED = {'stretch_bias': 0.1, 'stretch_gain': 0.3}
+_HIDDEN = ('remanence', 'chain_limit', 'constant_force')
 # Relaxation time of a suspected branch in time scales.
 _RELAXATION = 2.0
 
@@ -66,13 +70,15 @@ class Prior:
     def nominal(
             cls, actuator: ActuatorParameters, free: Sequence[str] = TRACKED, *,
             suspects: bool = False, others: Mapping[str, float] | None = None,
-            deviations: Mapping[str, float] | None = None) -> 'Prior':
+            deviations: Mapping[str, float] | None = None,
+            without: Sequence[str] = ()) -> 'Prior':
         """
         Return the prior of a block that was never identified.
 
-        With suspects, those of `SUSPECTS` are tracked too. ``others`` are values of coil and
-        sensor that differ from the defaults, and ``deviations`` replace some of `DEVIATIONS`,
-        in SI units. Raise `BadInputError` with the name that is unknown or cannot be tracked.
+        With suspects, those of `SUSPECTS` are tracked too, ``without`` some. ``others`` are values
+        of coil and sensor that differ from the defaults, and ``deviations`` replace some of
+        `DEVIATIONS`, in SI units. Raise `BadInputError` with the name that is unknown or cannot be
+        tracked.
         """
         free = check_free(free, actuator.law)
         wrong = [x for x in free if x in _NOT_TRACKED or x not in DEVIATIONS]
@@ -83,7 +89,7 @@ class Prior:
         named = len(free)
         if suspects:
             free = (*free, *(
-                x for x in SUSPECTS if x not in free
+                x for x in SUSPECTS if x not in free and x not in without
                 and not (x == 'chain_limit' and actuator.law is not None)
                 and not (x.startswith('viscoelastic') and any(actuator.creep.ratios))))
         # Feedback does not model secondary modes.
@@ -113,6 +119,18 @@ class Prior:
             values, free, np.diag(np.square(size)), np.array(size), tuple(
                 i for i, x in enumerate(free) if i >= named or x in _AS_GIVEN) if suspects else (),
             named)
+
+    @classmethod
+    def of_changed_sensor(
+            cls, actuator: ActuatorParameters, free: Sequence[str], known: Known, *,
+            others: Mapping[str, float]) -> 'Prior':
+        """Return the prior where bias and gain of the sensor may be anything; see `nominal`."""
+        found = cls.nominal(
+            actuator, tuple(dict.fromkeys(x for x in (*free, *_CHANGED) if x not in _HIDDEN)),
+            suspects=True, others=others, deviations=_CHANGED, without=_HIDDEN)
+        kept = [i for i, x in enumerate(known.names) if x not in _SENSED]
+        return found.informed(Known(
+            tuple(known.names[i] for i in kept), (), known.covariance[np.ix_(kept, kept)]))
 
     @property
     def coordinate(self) -> Coordinate:

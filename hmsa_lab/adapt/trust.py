@@ -21,6 +21,9 @@ class Trust:
     An estimate is used once a whole move has fitted, or ``at_once`` if requested. While samples do
     not fit, plans use the parameters that a move confirmed last, or the given ones. If the misfit
     persists, the estimator restarts.
+
+    After an estimate that was in use, what samples of one move show is not taken for the actuator:
+    `failed` then asks for an estimate with a sensor that may have changed.
     """
 
     def __init__(self, begin: int, *, at_once: bool) -> None:
@@ -43,8 +46,6 @@ class Trust:
         if self.acts and self._doubts < _PERSISTENT and not at_once:
             return False
         self._failures += self.acts
-        if self._failures > 1:
-            self.confirmed = None
         self.beginnings += 1
         self.acts, self._begin, self._doubts = False, now, 0
         # From the second failure on, each one doubles the number of moves that must fit.
@@ -71,6 +72,25 @@ class Trust:
         if self.acts or not self.beginnings:
             self.why = ''
         return False
+
+    @property
+    def failed(self) -> bool:
+        """Whether an estimate in use has failed to fit later samples."""
+        return self._failures > 0
+
+    def restarted(self, rejected: int) -> None:
+        """Count rejected samples from this number on: earlier ones led to the restart."""
+        self._rejected = rejected
+
+    def wait(self, now: int) -> None:
+        """Use the estimate after another move that fits."""
+        self.acts, self._begin, self._moves = False, now, 1
+
+    def recover(self, *, given: bool) -> None:
+        """Forget failures: the sensor is as it was; with the ``given`` parameters if so."""
+        self._failures = 0
+        if given:
+            self.confirmed = None
 
     def confirm(self, model: JointModel, left: float) -> None:
         """Record the error of a move planned with a model, as a fraction of its step."""

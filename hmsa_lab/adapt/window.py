@@ -29,6 +29,8 @@ _PASSES, _HALVINGS, _SMALL = 4, 4, 0.1
 _MORE = 1.3
 # Mean negative log probability of a sample above which a fit is poor; the usual value is 0.5.
 _POOR = 1.0
+# Standard deviations of a jump of the sensor, and its prior improbability as a logarithm.
+_JUMPS, _RARELY = {'stretch_bias': 0.05, GAIN: 0.1}, 3.0
 # Maximum change per step of a coordinate that is a logarithm.
 _STRIDE = 0.3
 
@@ -80,6 +82,7 @@ class Solution:
     # As `off` for plans, where other parameters represent an apparent gain of the sensor.
     instead: Array
     doubt: BiasCase
+    jumped: float = -math.inf  # log odds that the sensor jumped before the window
 
     def at_end(self) -> tuple[Array, Array, Array, BiasCase]:
         """Return coordinates and state at the requested time, their covariance and `off`."""
@@ -125,6 +128,8 @@ class Window:
     weighed: int = 0  # number of samples when these were chosen
     others: Others = Others(1.0, *(np.zeros(()),) * 3)  # effect of other sets
     rest: Rest | None = None  # equilibrium at the begin
+    first: bool = True  # whether the prior contains no samples
+    jumped: float = -math.inf  # as in `Solution`, when the suspects were weighed
     information: Array = field(init=False)  # inverse of the covariance, set by `settle`
 
     def values_at(self, z: Array) -> dict[str, Any]:
@@ -205,10 +210,12 @@ class Window:
                     found = other
                 else:
                     self.suspected, self.others = before
+            self.jumped = self._sensor_jumped(found)
         sure, off, square, instead = self.others
         return Solution(
             found.z, found.here, sure * inverse(found.matrix, found.loose) + square,
-            np.broadcast_to(off, z.shape), np.broadcast_to(instead, z.shape), self._doubt(found))
+            np.broadcast_to(off, z.shape), np.broadcast_to(instead, z.shape), self._doubt(found),
+            self.jumped)
 
     def _doubt(self, found: Optimum) -> BiasCase:
         """Return the expectation if a constant force and a gain may be in error, too."""
@@ -216,6 +223,30 @@ class Window:
         covariance = inverse(found.matrix, loose)
         off = covariance @ found.gradient
         return BiasCase(off, covariance + np.outer(off, off))
+
+    def _sensor_jumped(self, found: Optimum) -> float:
+        """
+        Return the log odds that bias and gain of the sensor jumped before the window.
+
+        The rival is that all is as in earlier windows, or as their samples leave open.
+        """
+        if self.first:
+            return -math.inf
+        places = np.flatnonzero(self.suspects.of(('stretch_bias', GAIN), len(found.z)))
+        covariance = self.covariance.copy()
+        covariance[places, places] += np.square([_JUMPS[self.free[i]] for i in places])
+        low, high = self._room(found.z)
+        odds = []
+        jumped: Array = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
+        for information in (self.information, jumped):
+            pull = information @ (self.mean - found.z)
+            change = information - self.information
+            odds.append(Evidence(
+                self.suspects, found.z, found.matrix + change,
+                found.gradient + change @ (self.mean - found.z), low, high).best(information)
+                - 0.5 * float((self.mean - found.z) @ pull))
+            low[places], high[places] = -math.inf, math.inf
+        return odds[1] - odds[0] - _RARELY
 
     def _is_poor(self, found: Optimum, noise: float) -> bool:
         """Return whether the estimated quantities explain the samples poorly."""
@@ -339,4 +370,4 @@ class Window:
         return Window(
             self.values, self.free, there,
             0.5 * (covariance + covariance.T), self.bounds, begin,
-            self.time[count:], self.stretch[count:], self.suspects, self.suspected)
+            self.time[count:], self.stretch[count:], self.suspects, self.suspected, first=False)
