@@ -119,10 +119,15 @@ class DeviceJoint:
         self._applied.publish(conversions.to_command(change.stamp, change.level, ''))
 
     def publish_receipt(self) -> None:
-        """Publish the newest command once it is processed, a new refusal, or a sign of life."""
-        steady, came = monotonic_ns(), 0 if self._commanded.busy else self._came
-        new = came or self.refuses != self._reported
-        if steady - self._reported_at < (_RECEIPTS if new else _SIGNS_OF_LIFE):
+        """Publish the newest command once it is processed or dropped, or a sign of life."""
+        steady = monotonic_ns()
+        passed = steady - self._reported_at
+        if passed < _RECEIPTS:
+            return
+        came = 0 if self._commanded.busy else self._came
+        # A heartbeat must not repeat a level that a stall has dropped.
+        dropped = self.refuses == conversions.LATE != self._reported
+        if passed < _SIGNS_OF_LIFE and not (came or dropped):
             return
         if came:
             self._processed, self._came = self._newest, 0
