@@ -257,6 +257,42 @@ def test_mounted_block_rests_by_modal_and_rings_by_two_step():
     assert max(left['modal']) < 1e-6
 
 
+@pytest.mark.parametrize('shaper', ['two_step', 'robust', 'smooth', 'zvd', 'minimum_time'])
+def test_plan_predicts_the_vibration_that_its_simulation_shows(shaper):
+    block = Actuator(half_length=5e-3, damping_ratio=0.05, mount='free', flux_density_limits=0.2)
+    plan, before = block.plan([(1.05, 0.3), (0.97, 0.3)], shaper), 1.0
+    seen = plan.simulate(rate=2e5)
+    for i, segment in enumerate(plan.segments):
+        target, period = segment.setpoint.stretch, block.model.frequency(segment.setpoint.stretch)
+        arrival = 0.3 * i + plan.move_times[i]
+        period = 2.0 * math.pi / period * block.model.units.time
+        left = seen.stretches[(seen.times >= arrival) & (seen.times < arrival + period)]
+        assert segment.left.vibration * abs(target - before) == pytest.approx(
+            float(np.ptp(left)), rel=0.02)
+        assert segment.left.mode == 2
+        assert f'by {segment.move.code} leaves a vibration of' in segment.notes()[-1]
+        before = target
+
+
+def test_only_actuators_with_modes_and_shapers_without_them_leave_a_predicted_vibration():
+    told = [Actuator(mount=x).plan([(1.05, 0.5)], y).segments[0].notes() for x, y in (
+        ('paper', 'two_step'), ('free', 'modal'))]
+    assert told == [[], []]
+
+
+def test_minimum_time_that_leaves_more_than_a_step_is_a_warning():
+    weak, strong = (
+        Planner(BLOCK, Options(shaper='minimum_time', flux_density_min=-x, flux_density_max=x))
+        for x in (0.06, 1.0))
+    assert weak.draft_setpoint(1.05, 0).warning is None
+    draft = strong.draft_setpoint(1.05, 0)
+    assert re.search(
+        r'1\.05 by minimum_time leaves a vibration of \d+ % .* an unshaped step \d+ %: expected '
+        'the shaper modal', draft.warning.told)
+    left = draft.segments[0].left
+    assert left.vibration > left.step > 0.5
+
+
 def test_damping_ratio_of_a_mounted_block_is_that_of_its_first_mode():
     block = Actuator(damping_ratio=0.05, mount='glued')
     assert block.damping_ratio == pytest.approx(0.05, rel=1e-12)

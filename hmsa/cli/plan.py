@@ -60,9 +60,12 @@ def add_parser(subparsers: Any) -> None:
          'initial stretch, at rest (default 1; 0 for the deflection of a beam)'),
         *((option, metavar, float, text) for option, metavar, text in MATERIAL), LAW_OPTION,
         ('--shaper', 'NAME', str,
-         'two_step (default), robust, minimax, minimum_time, smooth, step, zv, zvd, ei or umzv'),
+         'two_step (default), robust, minimax, minimum_time, modal, smooth, step, zv, zvd, ei or '
+         'umzv'),
         ('--order', 'N', int,
-         'number of two-step commands that robust cascades; minimax takes as long (default 2)',
+         'number of two-step commands that robust cascades; minimax takes as long; modal takes as '
+         'many half periods of a block with modes, and each above 2 adds half a period for a beam '
+         '(default 2)',
          {'default': 2}),
         ('--errors', 'G,C,J', str,
          'relative errors in shear modulus, damping and J_lim that minimax must tolerate (default '
@@ -303,7 +306,7 @@ def _errors(arguments: argparse.Namespace) -> list[float] | None:
 def _si_row(
         segment: 'Segment', units: 'Units', per_ampere: float | None) -> dict[str, Any]:
     """Return a segment with times in s, flux densities in T and any currents in A."""
-    row: dict[str, Any] = _row(segment)
+    row = _row(segment)
     levels = [[x.time * units.time, units.level(x.load)] for x in segment.move.levels]
     first, last = levels[0][1] if segment.shaped else None, units.level(segment.held)
     row |= {
@@ -316,7 +319,7 @@ def _si_row(
     return row
 
 
-def _row(segment: 'Segment') -> dict[str, float | str | None]:
+def _row(segment: 'Segment') -> dict[str, Any]:
     """Return a segment for the JSON output, with null for undefined numbers."""
     from hmsa.model.equations import signed_root
 
@@ -334,4 +337,5 @@ def _row(segment: 'Segment') -> dict[str, float | str | None]:
         'start_stretch': segment.start.stretch,
         'start_rate': segment.start.rate,
         'status': str(move.code),
-    } | ({'vibration': move.vibration} if move.tail else {})
+    } | ({'vibration': move.vibration} if move.tail else {}) | (
+        {} if segment.left is None else {'left': asdict(segment.left)})

@@ -399,7 +399,8 @@ def _placed(
         segment.setpoint.stretch, start,
         None if math.isinf(duration) else start + model.ns(duration),
         segment.move.code, segment.move.reason, start, segment.move.vibration,
-        None if math.isinf(segment.setpoint.span) else start + model.ns(segment.setpoint.span))
+        None if math.isinf(segment.setpoint.span) else start + model.ns(segment.setpoint.span),
+        left=segment.left)
 
 
 def _over(

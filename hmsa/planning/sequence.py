@@ -17,6 +17,7 @@ from hmsa.model.parameters import NondimensionalParameters
 from hmsa.model.simulation import follow, longest_motion, sampled
 from hmsa.model.status import Code, RefusedError
 from hmsa.motion import STRETCH
+from hmsa.planning.remaining import Remaining, remaining
 from hmsa.planning.setpoint import Setpoint
 from hmsa.planning.shapers import creeping, get_shaper
 from hmsa.planning.shapers.request import MoveRequest, Shaper, StepBudget
@@ -37,6 +38,8 @@ class Segment:
     end: State  #: predicted at the end of the setpoint, or after the last change of level
     move: Move  #: its times count from begin
     holding: float  #: load that holds the stretch after creep
+    #: Vibration of an actuator with secondary modes after the move; None for none.
+    left: Remaining | None = None
 
     @property
     def shaped(self) -> bool:
@@ -52,6 +55,8 @@ class Segment:
         """Return deviations from the request, one sentence each."""
         move = self.move
         found = [move.reason] if move.reason else []
+        if self.left is not None:
+            found.append(self.left.of(self.setpoint.stretch, move.code))
         if move.tail:
             step = abs(self.setpoint.stretch - self.start.stretch) or 1.0
             found.append(
@@ -145,7 +150,8 @@ def segments(
             move = move.until(setpoint.span)
         yield Segment(
             setpoint, begin, state, end, move,
-            float(law.elastic_force(setpoint.stretch, frame.material.packed)))
+            float(law.elastic_force(setpoint.stretch, frame.material.packed)),
+            remaining(request, move))
         begin += setpoint.span
         state = end
         setpoint = following

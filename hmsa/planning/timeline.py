@@ -26,6 +26,7 @@ from hmsa.model.simulation import follow, longest_motion, observed, sampled
 from hmsa.model.status import Code
 from hmsa.model.units import NANOSECONDS, Units
 from hmsa.planning.path import Path
+from hmsa.planning.remaining import Remaining
 from hmsa.planning.sequence import check_short_spell
 from hmsa.planning.shapers import creeping, get_shaper
 from hmsa.planning.shapers.request import as_errors, ERRORS
@@ -265,6 +266,14 @@ class PlannedSegment:
     carried_out: bool = True  #: whether its commands were sent and took effect, as far as known
     #: Path to follow, in s from ``since`` on; None for a move.
     path: Path | None = field(default=None, compare=False, repr=False)
+    #: Vibration of an actuator with secondary modes after the move; None for none.
+    left: Remaining | None = None
+
+    @property
+    def told(self) -> str:
+        """How the move differs from the request, and what it leaves; empty if nothing is."""
+        left = '' if self.left is None else self.left.of(self.stretch, self.code)
+        return '; '.join(filter(None, (self.reason, left)))
 
     def shifted(self, span: int) -> 'PlannedSegment':
         """Return the segment with its times shifted by some ns."""
@@ -331,9 +340,10 @@ class Draft:
 
     @property
     def warning(self) -> PlannedSegment | None:
-        """The first setpoint reached only roughly, by another command than the requested one."""
+        """The first setpoint reached only roughly: by another command, or worse than by a step."""
         return next((x for x in self.segments if x.code in _WARNINGS
-                     or x.code is Code.PATH and x.reason), None)
+                     or x.code is Code.PATH and x.reason
+                     or x.left is not None and x.left.worse), None)
 
     def delayed(self, delays: Sequence[int]) -> 'Draft':
         """Return the draft with the move of each segment delayed by its delay in ns."""

@@ -44,8 +44,9 @@ OWN = (
         'shaper', 'two_step', 'Shaper that plans each move.', choices=tuple(SHAPERS)),
     _changeable(
         'robust_order', 2,
-        'Number of two-step commands that the shaper robust cascades, and of half periods that '
-        'modal takes.', '', 1, MOST_ORDER),
+        'Number of two-step commands that the shaper robust cascades. For a block with secondary '
+        'modes, modal takes as many half periods of the first mode; for a beam, each above 2 adds '
+        'half a period.', '', 1, MOST_ORDER),
     _changeable(
         'minimax_errors', list(ERRORS),
         'Relative errors in shear modulus, damping coefficient and J_lim for which the shaper '

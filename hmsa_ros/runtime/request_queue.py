@@ -144,7 +144,7 @@ class RequestQueue:
                 'stopping: comes to rest without vibration; ~/status says once plant or driver '
                 'has acknowledged it')
         if warnings:
-            severity, code, words = Severity.WARN, warnings[0].code, warnings[0].reason
+            severity, code, words = Severity.WARN, warnings[0].code, warnings[0].told
         elif not changed:
             code, words = Code.UNCHANGED, 'already on the way there: the plan is unchanged'
         self._reporting.give(Verdict(severity, code, words, request.name), log=bool(warnings))
@@ -175,8 +175,12 @@ class RequestQueue:
 
 
 def _accepted(drafts: Mapping[str, Draft]) -> str:
-    """Return a message that drafts are accepted, with the vibration that creep leaves."""
-    left = max((x.vibration for draft in drafts.values() for x in draft.segments), default=0.0)
-    if left == 0.0:
-        return 'accepted'
-    return f'accepted; levels that follow creep leave a vibration of up to {left:.1e}'
+    """Return a message that drafts are accepted, with the vibration that modes and creep leave."""
+    planned = [x for draft in drafts.values() for x in draft.segments]
+    words = ['accepted']
+    ringing = [x for x in planned if x.left is not None]
+    if ringing:
+        words.append(max(ringing, key=lambda x: x.left.vibration if x.left else 0.0).told)
+    if left := max((x.vibration for x in planned), default=0.0):
+        words.append(f'levels that follow creep leave a vibration of up to {left:.1e}')
+    return '; '.join(words)
