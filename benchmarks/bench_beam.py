@@ -16,9 +16,11 @@ import math
 import numpy as np
 
 from benchmarks.beam_rod import FIRST, Rod
+from benchmarks.bench_continuum import advised
 from benchmarks.sheet import Sheet
 from hmsa import Actuator
 from hmsa.api.doubts import unquestioned
+from hmsa.identification.measurement import Measurement
 from hmsa.model.equations import elastic_force
 from hmsa.model.laws.bending import deflection
 from hmsa.model.laws.elastica import FIRST_SHARE
@@ -36,6 +38,10 @@ _MOVES, _LARGEST = 6, 70.0
 _MOST, _MOST_BESIDE, _LONGEST = 1.0, 0.1, 1.35
 # Periods of the first mode after arrival that are followed, and samples in them.
 _PERIODS, _SAMPLES = 4, 800
+# Moves of a recording, periods on each, points that the rod computes between two levels, samples
+# in a period and their noise; error of the remanence from which an identification is wrong.
+_STEPS, _DWELL, _RECORDED, _RATE, _NOISE, _WRONG = 8, 12.0, 400, 18.0, 1e-3, 0.01
+_SWINGS = 30.0  # largest angle, of which steps overshoot
 # Smallest move of a random sequence in degrees, of which the rod still tells 0.1 %.
 _SMALLEST = 3.0
 
@@ -58,7 +64,7 @@ class _Laboratory:
 
     ratio: float
 
-    def strip(self, mount: str) -> Actuator:
+    def actuator(self, mount: str) -> Actuator:
         """Return the strip as the package has it."""
         with unquestioned():  # of its weight
             return Actuator.beam(
@@ -68,11 +74,11 @@ class _Laboratory:
     def move(self, start: float, target: float, mount: str, shaper: str) -> Move:
         """Return the command of a move between two deflections."""
         return get_shaper(shaper)(
-            MoveRequest(State(start), target, self.strip(mount).model.material))
+            MoveRequest(State(start), target, self.actuator(mount).model.material))
 
     def moved(self, start: float, target: float, mount: str, shaper: str) -> _Found:
         """Return what a move between two deflections leaves."""
-        material, rod = self.strip(mount).model.material, Rod(self.ratio)
+        material, rod = self.actuator(mount).model.material, Rod(self.ratio)
         # Tables and rod: first frequencies of sqrt(3) and FIRST, loads over FIRST_SHARE and 1.
         unit, load = FIRST / math.sqrt(3.0), 1.0 / FIRST_SHARE
         move = self.move(start, target, mount, shaper)
@@ -145,6 +151,57 @@ def sequences(*, quick: bool, runs: int) -> Sheet:
          'time, longest'), rows, {'rows': figures}, passed)
 
 
+def identified(*, quick: bool, runs: int) -> Sheet:
+    """Return how recordings of random angles identify the beam, whose mode's shape is given."""
+    rows, figures, sums = [], [], [0, 0, 0, 0]
+    for ratio in _RATIOS[:1] if quick else _RATIOS:
+        for shaper in ('step', 'two_step'):
+            counts, errors = [0, 0, 0], list[float]()
+            for seed in range(1 if quick else runs):
+                strip, recording = _recorded(ratio, shaper, seed)
+                plain, found = advised(recording, strip.block)
+                counts[0] += 'second mode' in plain.reason
+                if found.verdict == 'identified':
+                    errors.append(found.actuator.remanence / strip.block.remanence - 1.0)
+                    counts[1] += 1
+                    counts[2] += abs(errors[-1]) > _WRONG
+            total = 1 if quick else runs
+            sums = [x + y for x, y in zip(sums, (*counts, total), strict=True)]
+            worst = 100.0 * max(errors, key=abs, default=math.nan)
+            rows.append([
+                f'{ratio:g}, {shaper}', *(f'{x} of {total}' for x in counts), f'{worst:+.2f}'])
+            figures.append({'ratio': ratio, 'shaper': shaper, 'counts': counts, 'errors': errors})
+    rows.append(['all', *(f'{x} of {sums[3]}' for x in sums[:3]), ''])
+    return Sheet(
+        'beam-identification',
+        f'Recordings of {_STEPS} moves on an exact rod, noise {_NOISE:g}: second mode named, then '
+        'identified with the options that were advised; wrong: remanence more than '
+        f'{100.0 * _WRONG:g} % off',
+        ('damping ratio, moves', 'second mode named', 'identified', 'identified and wrong',
+         'largest error of the remanence in %'),
+        rows, {'rows': figures}, sums[2] == 0)
+
+
+def _recorded(ratio: float, shaper: str, seed: int) -> tuple[Actuator, Measurement]:
+    """Return the beam in its mode's shape, and a noisy recording of moves to random angles."""
+    laboratory, random = _Laboratory(ratio), np.random.default_rng((seed, round(100.0 * ratio)))
+    actuator, rod = laboratory.actuator('paper'), Rod(ratio)
+    period = actuator.block.period
+    angles = _random(random, _STEPS, _SWINGS)
+    plan = actuator.plan([(_of_degrees(x), _DWELL * period) for x in angles[1:]], shaper)
+    times = np.append(0.0, plan.times + period)
+    fields = np.append(0.0, plan.flux_densities)
+    scale = FIRST / math.sqrt(3.0) * actuator.block.time_unit
+    ends = np.append(times[1:], period * (1.0 + _DWELL * _STEPS))
+    moved, bent = rod.follow(0.0, [
+        ((end - begin) / scale, float(actuator.model.units.of_level(level)) / FIRST_SHARE)
+        for begin, end, level in zip(times, ends, fields, strict=True)], _RECORDED)
+    samples = np.arange(0.0, ends[-1], period / _RATE)
+    return actuator, Measurement(
+        samples, np.interp(samples, moved * scale, bent) + _NOISE * random.standard_normal(
+            len(samples)), times, fields, coordinate=actuator.block.coordinate)
+
+
 def _kept(found: _Found, time: float) -> bool:
     return found.vibration <= _MOST and abs(found.beside) <= _MOST_BESIDE and time <= _LONGEST
 
@@ -153,11 +210,12 @@ def _pairs(angles: Sequence[float]) -> Iterator[tuple[float, float]]:
     return zip(angles, angles[1:], strict=False)
 
 
-def _random(random: np.random.Generator, moves: int) -> list[float]:
+def _random(
+        random: np.random.Generator, moves: int, largest: float = _LARGEST) -> list[float]:
     """Return angles in degrees, each some way from the one before."""
     angles = [0.0]
     while len(angles) <= moves:
-        angle = round(float(random.uniform(-_LARGEST, _LARGEST)), 1)
+        angle = round(float(random.uniform(-largest, largest)), 1)
         if abs(angle - angles[-1]) >= _SMALLEST:
             angles.append(angle)
     return angles

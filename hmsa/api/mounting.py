@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 
 from hmsa.errors import BadInputError
-from hmsa.interfaces.actuator import actuator_from, parameters_of
+from hmsa.interfaces.actuator import actuator_from, along_elastica, parameters_of
 from hmsa.model.continuum import check_mount, clamped, mounted
 from hmsa.model.equations import critical_zeta, elastic_force, equilibrium_stretch
-from hmsa.model.laws.beam import ELASTIC_CURVE
 from hmsa.model.modes import Modes, MOUNTS
 from hmsa.model.moves import State
 from hmsa.model.parameters import ActuatorParameters
@@ -72,8 +71,7 @@ def _held(block: ActuatorParameters, mount: str, ratio: float | None) -> Actuato
 
 def _clamped(beam: ActuatorParameters, _: str, ratio: float | None) -> ActuatorParameters:
     """Return a beam along its elastica, with its second mode."""
-    made = replace(
-        actuator_from(parameters_of(beam) | {'law.shape': ELASTIC_CURVE}), creep=beam.creep)
+    made = along_elastica(beam)
     critical = float(critical_zeta(0.0, made.nondimensional))
     if ratio is None:
         ratio = made.nondimensional.zeta / critical

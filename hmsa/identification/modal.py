@@ -18,6 +18,7 @@ from hmsa.identification.quantities import MODES, SECONDARY
 from hmsa.identification.result import Mode
 from hmsa.model import equations
 from hmsa.model.equations import Array
+from hmsa.model.laws.record import BEAMS
 
 # Frequency ratios from which each mode is sought, besides those of the lines in the residuals.
 _STARTS = (1.2, 1.4, 1.7, 2.1, 2.7, 3.4, 4.5, 6.0)
@@ -33,6 +34,8 @@ _WHOLE = 0.9
 _CHI_SQUARED, _PART = 30.0, 0.15
 # Ratio of two frequencies below which they are those of one mode that changes with the stretch.
 _NEAR = 1.02 * LEAST_RATIO
+# Lowest ratio of a mode of a beam: the second has 6.3 where straight, 3.6 where bent to 0.75.
+_OF_BEAMS = 2.5
 # Relative change of the force by J_lim that is noticeable.
 _STIFFENS = 0.04
 #: Fraction of the residuals' sum of squares that all modes together explain at least.
@@ -111,7 +114,7 @@ def with_modes(
     recording = one.recording
     best = fit(recording, start, free, most=_FIRST) or one
     own = frequency_of(best)
-    highest = highest_ratio(recording, own)
+    highest, lowest = highest_ratio(recording, own), _lowest(best.values)
     wide, values = tuple(free), dict(best.values)
     if values['law'] is None or not values['law'].section:
         wide = (*(x for x in free if x != 'chain_limit'), 'transverse_mass_factor')
@@ -123,7 +126,8 @@ def with_modes(
     for i, names in enumerate(SECONDARY[:most]):
         begins = [(x.ratio, x.damping) for x in lines_of(best, own, 2)[0]]
         begins += [(x, min(max(damping, _LEAST_DAMPING) * x, _MOST_DAMPING)) for x in _STARTS]
-        rows = [*given[i:i + 1], *((x, _SHARE, y) for x, y in begins if x < highest)]
+        rows = [
+            *given[i:i + 1], *((x, _SHARE, y) for x, y in begins if lowest < x < highest)]
         wanted = (*wide, *names[:3])
         trials = [y for x in rows if (y := fit(
             recording, {**values, **dict(zip(names, x, strict=False))}, wanted,
@@ -161,11 +165,19 @@ def _damping_ratio(values: Mapping[str, Any]) -> float:
         equations.critical_zeta(group.rest, group)))
 
 
+def _lowest(values: Mapping[str, Any]) -> float:
+    """Return the lowest possible ratio of a secondary mode."""
+    law = values['law']
+    return _OF_BEAMS if law is not None and law.family in BEAMS else 1.0
+
+
 def _possible(found: Fit) -> bool:
     """Return whether the modes of a fit are those of an actuator."""
     values = found.values
     modes = quantities.modes_of(values)
     ratios = sorted((1.0, *(values[x[0]] for x in modes)))
+    if len(ratios) > 1 and ratios[1] < _lowest(values):
+        return False
     return all(y > _NEAR * x for x, y in pairwise(ratios)) and sum(
         abs(values[x[1]]) for x in modes) < _WHOLE
 

@@ -9,6 +9,8 @@ from hmsa.interfaces.parameters import ACTUATOR_FIELDS, LAW, LAW_NAME, MODES, VI
 from hmsa.model.creep import Creep
 from hmsa.model.flows import FLOWS
 from hmsa.model.laws import LAWS
+from hmsa.model.laws.beam import ELASTIC_CURVE
+from hmsa.model.laws.record import BEAM
 from hmsa.model.modes import Modes
 from hmsa.model.parameters import ActuatorParameters
 
@@ -54,6 +56,14 @@ def actuator_from(
         law=elastic, modes=modes,
         **{name.removeprefix('actuator.'): value for name, value in continuum.items()},
         **{name: value * values.get(f'mismatch.{name}', 1.0) for name, value in numbers.items()})
+
+
+def along_elastica(beam: ActuatorParameters) -> ActuatorParameters:
+    """Return a beam along its elastica; another actuator, or such a beam, does not change."""
+    if beam.law is None or beam.law.family != BEAM:
+        return beam
+    return replace(
+        actuator_from(parameters_of(beam) | {'law.shape': ELASTIC_CURVE}), creep=beam.creep)
 
 
 def model_from(
