@@ -1,11 +1,12 @@
 """
-A free block as a continuum, by explicit finite elements, to judge what the package's model omits.
+A block as a continuum, by explicit finite elements, to judge what the package's model omits.
 
-An eighth of the block by symmetry: bricks of eight nodes whose dilatation is averaged (Q1P0), a
-lumped mass and central differences. The material is that of Gent with a bulk modulus far above G
-and a viscous deviatoric stress. A uniform field along the magnetisation is a dead traction on the
-faces across it (R. Zhao et al., J. Mech. Phys. Solids 124, 244, 2019). Lengths are in units of L,
-with G = rho = 1. It shares no equation with the package.
+An eighth of a free block by symmetry, or a quarter of one that is glued with a face: bricks of
+eight nodes whose dilatation is averaged (Q1P0), a lumped mass and central differences. The
+material is that of Gent with a bulk modulus far above G and a viscous deviatoric stress. A uniform
+field along the magnetisation is a dead traction on the faces across it (R. Zhao et al., J. Mech.
+Phys. Solids 124, 244, 2019). Lengths are in units of L, with G = rho = 1. It shares no equation
+with the package.
 """
 
 from collections.abc import Sequence
@@ -25,10 +26,11 @@ _GAUSS = 1.0 / np.sqrt(3.0)
 class Block:
     """Positions and velocities of the nodes of a block that starts at rest without a field."""
 
-    shape: float  #: H/L
+    shape: float  #: H/L; of a glued block, its whole height over L
     j_lim: float
     viscosity: float  #: of the deviatoric stress, in units of L sqrt(G rho)
     cells: tuple[int, int, int]  #: elements along x, y and z, the direction of the field
+    glued: bool = False  #: whether the face opposite to that of the load is fixed
     position: Array = field(init=False)  #: shape (n, 3)
     velocity: Array = field(init=False)
 
@@ -57,6 +59,8 @@ class Block:
             volume / 8.0)
         # Nodes in a plane of symmetry stay in it.
         self._free = self.position > 1e-12
+        if self.glued:
+            self._free &= self._free[:, 2:]
         self._top = number[:, :, -1].ravel()
         edges = [np.where((np.arange(n + 1) % n) == 0, 0.5, 1.0) / n for n in self.cells[:2]]
         self._areas = np.outer(*edges).ravel()
