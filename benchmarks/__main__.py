@@ -18,7 +18,8 @@ laboratories, for half an hour. laboratory tunes laboratories behind a serial bo
 of an hour; line makes cables, boards, amplifiers and sensors fail there, for two minutes. studies
 kills the workers of a study. rates measures how many plans per second studies compute, for about
 seven minutes. lockstep compares the kernel of batches with C. continuum plays commands on finite
-elements, for ten minutes; beam on an exact rod, for three; beam-identification identifies
+elements, for five minutes; predictions compares what plans predict there, for two; beam plays
+them on an exact rod, for three; beam-identification identifies
 recordings of this rod, for five.
 repeats plays what `hmsa learn` makes of repeats on finite elements and an exact rod, for half an
 hour.
@@ -47,8 +48,8 @@ NAMES = ('judge', 'planner', 'plant', 'preemption', 'joints', 'controller', 'rec
          'crash')
 #: Only run on request: they take long and need the machine for themselves.
 LONG = ('faults', 'soak', 'feedback', 'identification', 'defects', 'harm', 'laboratory',
-        'line', 'studies', 'rates', 'lockstep', 'continuum', 'repeats', 'beam',
-        'beam-identification', 'modes')
+        'line', 'studies', 'rates', 'lockstep', 'continuum', 'predictions',
+        'repeats', 'beam', 'beam-identification', 'modes')
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -68,7 +69,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument('--runs', type=int, default=None,
                         help='harm: laboratories (default 400); laboratory, line: of each kind '
                              '(default 20); beam: random sequences (default 4); '
-                             'beam-identification: recordings of each kind (default 4); identification, '
+                             'beam-identification: recordings of each kind (default 4); '
+                             'identification, '
                              'judge, defects: simulated runs of each kind '
                              '(default 200, defects 30), in identification at most 40 of those')
     parser.add_argument('--hours', type=float, default=8.0,
@@ -178,6 +180,9 @@ def main(arguments: list[str] | None = None) -> int:
         from benchmarks import bench_continuum
 
         add(bench_continuum.compare(quick=options.quick))
+    if 'predictions' in names:
+        from benchmarks import bench_continuum
+
         add(bench_continuum.predicted(quick=options.quick))
     if 'beam' in names:
         from benchmarks import bench_beam
