@@ -430,6 +430,13 @@ def test_progress_is_shown_on_a_terminal_and_gone_at_the_end(capsys):
     assert (captured.out, captured.err) == ('', '')
 
 
+def test_without_a_terminal_the_first_activity_can_be_said_at_once(capsys):
+    with progress('loading', lines=60.0, at_once=True) as update:
+        assert capsys.readouterr().err == 'loading ...\n'
+        update('levels', 0.0)
+    assert capsys.readouterr().err == 'levels ...\n'
+
+
 def test_a_notebook_which_asks_for_colours_gets_no_progress():
     shown = subprocess.run(
         [sys.executable, '-c', PROGRESS], cwd=ROOT, env={**os.environ, 'FORCE_COLOR': '1'},

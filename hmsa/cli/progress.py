@@ -18,14 +18,14 @@ PATIENCE = 1.5
 
 @contextmanager
 def progress(
-        what: str = 'starting', *, lines: float = math.inf
+        what: str = 'starting', *, lines: float = math.inf, at_once: bool = False
 ) -> Iterator[Callable[[str, float | None], None]]:
     """
     Yield a function of the current activity and the completed fraction or None.
 
     Where no bar can be shown, a line says the activity that is under way after ``lines`` s, each
     later one, and how long one has lasted after every ``lines`` s more: what fails at once leaves
-    its error alone.
+    its error alone. With ``at_once`` the first activity gets its line immediately.
     """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
@@ -60,6 +60,8 @@ def progress(
 
     waiter = None if bar or math.isinf(lines) else threading.Thread(target=wait, daemon=True)
     if waiter is not None:
+        if at_once:
+            say()
         waiter.start()
     with Progress(
             TextColumn('{task.description:<28}'), BarColumn(), TextColumn('{task.fields[share]}'),

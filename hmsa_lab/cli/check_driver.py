@@ -45,12 +45,14 @@ def run(arguments: argparse.Namespace) -> int:
         If the folder of the page does not exist, or a setting is invalid.
 
     """
-    from hmsa_lab.bench.conformance import ConformanceTrial
-
     check_targets(arguments.report)
-    with progress(lines=PATIENCE) as update:
+    settings = settings_of(arguments)
+    # The module takes a second to import.
+    with progress(f'loading {arguments.hardware}', lines=PATIENCE, at_once=True) as update:
+        from hmsa_lab.bench.conformance import ConformanceTrial
+
         found = ConformanceTrial(
-            arguments.hardware, arguments.joint, settings_of(arguments), level=arguments.limit,
+            arguments.hardware, arguments.joint, settings, level=arguments.limit,
             rate=arguments.rate).run(update)
     if arguments.report is not None:
         from hmsa_lab.report.conformance import page
