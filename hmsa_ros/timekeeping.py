@@ -52,5 +52,5 @@ class StepWatch:
 def clock_set_words(by: int, what: str) -> str:
     """Return a message that a clock was set ahead by some ns, and what continues unchanged."""
     return (f'the clock of this host was set {"ahead" if by > 0 else "back"} by '
-            f'{abs(by) / NANOSECONDS:.3f} s: {what} as long from now as before; have it slewed, '
-            'not set, while an experiment runs')
+            f'{abs(by) / NANOSECONDS:.3f} s: {what} as long from now as before; let the time '
+            'service slew the clock, not set it, while an experiment runs')

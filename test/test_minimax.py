@@ -198,7 +198,7 @@ def test_it_is_never_worse_than_the_chain_on_any_hardware(delivery, state):
             assert level.time / delivery.period == pytest.approx(
                 round(level.time / delivery.period), abs=1e-9)
     if move.code is not Code.MINIMAX:
-        assert 'the chain of order 2' in move.reason or chain.reason
+        assert 'the cascade of order 2' in move.reason or chain.reason
 
 
 def test_a_move_is_designed_once_and_anew_for_other_errors():

@@ -28,8 +28,9 @@ EXPLANATIONS: Mapping[Code, tuple[str, str]] = {
         'No action needed; the shaper minimum_time arrives sooner.'),
     Code.LEVELS: ('Raw levels as sent, with rest at the end.', ''),
     Code.PATH: (
-        'A path with velocities is followed (trajectory_mode: path). As a warning: limits keep '
-        'the actuator from the path, by the largest deviation that the message names.',
+        'The plan follows a path with velocities (trajectory_mode: path). With WARN: limits of '
+        'the coil prevent the actuator from following the path; the message contains the largest '
+        'deviation.',
         'Slow the path down, or widen the limit that the message names.'),
     Code.OUT_OF_RANGE: (
         'The stretch is at or beyond a limit of the hyperelastic model: the full extension of the '
@@ -95,8 +96,8 @@ EXPLANATIONS: Mapping[Code, tuple[str, str]] = {
         'Repair the sensor, or stop its publisher; without samples moves start as predicted.'),
     Code.UNHEARD: (
         'Commands do not arrive: the plant or driver has ended, or a link works in one direction '
-        'only. After a stop: it was not acknowledged, and whether the actuator rests is not '
-        'known.',
+        'only. After a stop: the stop was not acknowledged, so the planner cannot know whether '
+        'the actuator rests.',
         'Start the plant or driver, or repair the network from the host of the planner to its '
         'host; then send the request again. After a stop, switch the coil off at the driver '
         'first.'),
@@ -110,7 +111,7 @@ EXPLANATIONS: Mapping[Code, tuple[str, str]] = {
         '(`hardware.reconnect`): the coil is off, and the rest of the sequence was dropped.',
         'Close the interlock or plug the cable in, then send the request again. Nothing continues '
         'by itself.'),
-    Code.NONE: ('No request has come yet.', ''),
+    Code.NONE: ('No request has arrived yet.', ''),
     Code.WAITING: (
         'The request is accepted and starts as soon as the current state is known.', ''),
     Code.ACCEPTED: ('The request is planned and is being executed.', ''),
@@ -126,13 +127,14 @@ EXPLANATIONS: Mapping[Code, tuple[str, str]] = {
         'Measured moves became worse with feedback: plans use the given parameters, in open loop.',
         'Check the sensor, then call ~/reset_estimate.'),
     Code.SATURATED: (
-        'The amplifier did not reach a commanded level. Until the next request no level beyond '
-        'that is commanded, and the rest of the sequence is planned within it.',
+        'The amplifier did not reach a commanded level. Until the next request, the planner '
+        'commands no level beyond the reached one, and plans the rest of the sequence within '
+        'this limit.',
         'Set flux_density_max or flux_density_min to the limit of the amplifier.'),
     Code.STOPPED: (
         'With OK: the actuator has come to rest after a stop, which plant or driver has '
-        'acknowledged. With ERROR: it comes to rest, since the rest of the sequence could not be '
-        'planned anew, for the reason that the message gives.',
+        'acknowledged. With ERROR: the planner brings the actuator to rest, because the rest of '
+        'the sequence could not be planned again; the message gives the reason.',
         'Send the request again.'),
     Code.CLOCK_JUMPED: (
         'The clock was set. If simulated time went back, the plan was dropped; after a step of '
@@ -148,19 +150,18 @@ EXPLANATIONS: Mapping[Code, tuple[str, str]] = {
         'Measured: the stretch vibrates about the setpoint by more than vibration_tolerance.',
         "Correct the actuator's parameters, as with hmsa identify, or raise the tolerance."),
     Code.LATE: (
-        'The stretch came to rest at the setpoint only after its time, as commands took effect '
-        'late.',
+        'The actuator came to rest only after the end of the setpoint, because commands took '
+        'effect late.',
         'Raise lead_time, or see what delays commands.'),
     Code.MISSED: (
-        'The setpoint was not carried out: a plan that was made anew left it out, or plant or '
-        'driver came after its commands were sent.',
+        'The setpoint was not executed: a new plan left it out, or the plant or driver started '
+        'after its commands were sent.',
         'Raise lead_time, or see what delays or drops commands; start plant or driver first.'),
     Code.UNDECIDED: (
         'Measured, but the samples show neither that the stretch rests within the tolerances nor '
         'that it does not.',
         'Hold the setpoint longer, or sample faster or with less noise, as the message says.'),
     Code.UNOBSERVED: (
-        'Predicted, not measured: no samples came while the setpoint was held, or none that '
-        'count.',
+        'Predicted, not measured: no valid samples arrived while the setpoint was held.',
         'Publish joint_states to have it measured; or repair the sensor that the message names.'),
 }

@@ -92,8 +92,8 @@ def _of_sizes(form: str, values: Mapping[str, float]) -> Iterator[str]:
             values['youngs_modulus'] * values['thickness'] ** 2)
         if sag > _SAG:
             yield (
-                f'lying, the beam sags by {sag:.2g} of its length under its own weight, which the '
-                'model does not know: clamp it so that it bends in a horizontal plane')
+                f'lying, the beam sags by {sag:.2g} of its length under its own weight, which '
+                'the model neglects: clamp it so that it bends in a horizontal plane')
     if form == 'block':
         ratio = values['half_thickness'] / values['half_length']
         if not _SIMILAR[0] <= ratio <= _SIMILAR[1]:

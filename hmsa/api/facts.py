@@ -24,9 +24,9 @@ def facts(found: Scales, block: ActuatorParameters) -> list[tuple[str, str]]:
         *((f'flux density for {stretch:.6g}', flux_text(level, '.4g'))
           for stretch, level in found.flux_densities),
         (f'coil holds {words}', '{:.6g} to {:.6g}'.format(*found.held)),
-        ('two steps reach from rest', 'nothing' if found.reached == (block.rest,) * 2
+        ('two-step range from rest', 'none' if found.reached == (block.rest,) * 2
          else '{:.6g} to {:.6g}'.format(*found.reached)),
-        ('a move from rest', 'none in two steps' if math.isnan(found.duration)
+        ('move time from rest', 'no two-step command' if math.isnan(found.duration)
          else f'{_time_text(found.duration)} to {found.target:.6g}')]
 
 

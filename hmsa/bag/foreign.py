@@ -72,8 +72,9 @@ class ForeignFile:
             ) from error
         log = path.with_name(f'{path.name}-wal')
         if log.is_file() and log.stat().st_size:
-            self.problem(f': the messages in {log.name} are not read: its recorder was killed, '
-                         f'or is still at work; sqlite3 {path.name} "PRAGMA wal_checkpoint" moves '
+            self.problem(f': the messages in {log.name} are not read: the recorder of the bag '
+                         f'was killed, or is still recording; sqlite3 {path.name} "PRAGMA '
+                         'wal_checkpoint" moves '
                          'them into the bag')
 
     @property

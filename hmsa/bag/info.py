@@ -77,8 +77,8 @@ class BagSummary:
             total = self.message_count + self.unreadable
             parts.append(f'{self.unreadable} of {total} messages cannot be read')
         if not self.closed:
-            parts.append('the last messages may be missing, since it was cut off, or its recorder '
-                         'was killed or is still at work')
+            parts.append('the last messages may be missing: the bag was cut off, or its recorder '
+                         'was killed or is still recording')
         elif not (self.complete or self.unreadable):
             parts.append('a part of it is damaged')
         lost = [f'{x.lost} of {x.name}' for x in self.topics

@@ -119,7 +119,7 @@ class BagReader:
         noted.pop(metadata.NOT_ENDED, None)
         if not self._ended:
             intake.problem(f'{self.path} was not closed by its recorder: it was killed, or '
-                           'is still at work')
+                           'is still recording')
         self.custom_data = noted or {
             key: value for key, value in self.records.get(EXPERIMENT, {}).items()
             if key != 'version'}

@@ -2,9 +2,9 @@
 Compare runs in numbers, and in a picture.
 
 Print move time, offset and residual vibration of each setpoint for several runs, and the largest
-distance of each curve from that of the first run. Of folders that hmsa run --repeat wrote, print
-mean, standard deviation and maximum over the repeats; their pictures show the mean of each
-arrival, and the standard deviation as a band.
+distance of each curve from that of the first run. For folders of hmsa run --repeat, print mean,
+standard deviation and maximum over the repeats. Their pictures show the mean around each arrival,
+and the standard deviation as a band.
 
 example: hmsa compare run_zv run_two_step --picture both.pdf --width 85
 """

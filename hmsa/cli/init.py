@@ -74,9 +74,9 @@ def add_parser(subparsers: Any) -> None:
         *map(_option, (*QUANTITIES, *(x for x in EVERY if x not in QUANTITIES), DAMPING)),
         LAW_OPTION,
         ('--mount', 'MOUNT', str,
-         'how it is held: a block free or glued (with one face, to a rigid support), a beam '
-         "clamped; each with its modes; or paper (the paper's model: uniform deformation, or the "
-         'shape of the first mode of a beam; default)',
+         'how the actuator is held: free or glued (one face on a rigid support) for a block, '
+         "clamped for a beam, each with its modes; or paper (the paper's model: uniform "
+         'deformation, or the shape of the first mode of a beam; default)',
          {'default': MOUNTS[0], 'choices': MOUNTS}),
         ('--joint', 'NAME', str,
          f'joint name (default {_JOINT}), or several separated by commas for identical actuators',

@@ -46,8 +46,8 @@ def picture_options(
     if panels:
         rows.append((
             '--panels', 'NAME,...', str,
-            f'panels, of {", ".join(PANELS)} (default: {", ".join(WIDE)}; in a column without '
-            'phase)', {'default': ''}))
+            f'panels, of {", ".join(PANELS)} (default: {", ".join(WIDE)}; without phase in a '
+            'single column)', {'default': ''}))
     if data:
         rows.append(('--data', 'also write the plotted values as CSV, under the same name'))
     files: tuple[Row, ...] = (

@@ -37,8 +37,8 @@ def add_parser(subparsers: Any) -> None:
         ('--out', 'FILE', Path,
          'levels to write, ending in .csv, .parquet or .mat; an existing file is replaced'),
         ('--path', 'CSV', Path,
-         'points of the wave to write, which hmsa run --path and hmsa send --path follow; no '
-         'square wave'),
+         'points of the wave to write, for hmsa run --path and hmsa send --path; not available '
+         'for square'),
         JSON)
 
 

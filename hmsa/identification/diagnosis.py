@@ -274,7 +274,7 @@ def misfit(
         f'to the next (white with a probability of {found.p_value:.2g})')
     if distant(fit, found) and not any(x.remedy == quantities.MODES for x in seen):
         return (
-            f'no motion of the model is like the recorded one: {figures}, against a motion of '
+            f'the model cannot reproduce the recorded motion: {figures}, against a motion of '
             f'{motion:.3g} rms; check that times are in s and levels in tesla, of one clock and '
             f'one run, and that --params-file describes the actuator{_remedy(seen) or _LOOK}')
     if fit.scale < _NUMERICAL:
@@ -390,7 +390,7 @@ def alike(best: Fit, others: Sequence[Fit]) -> str:
     if len(words) > _FEW_WORDS:
         words[2:-1] = [f'{len(words) - 3} between']
     return (
-        f'these frequencies fit alike: {_listed(words)}; record '
+        f'these frequencies fit equally well: {_listed(words)}; record '
         f'at more than {2.0 * frequencies[-1]:.3g} samples per second, or give a --params-file '
         'whose shear_modulus and density are known, and free what is not, as with '
         f'--params-file actuator.yaml {freeing(best, _TIMED)}')

@@ -156,8 +156,8 @@ class _Sequence:
             if target.end - self.rests[-1] < period:
                 raise BadInputError(
                     f'setpoint {target.stretch:g} is held for {target.end - self.rests[-1]:.3g} s '
-                    f'after its move: expected at least a period, {period:.3g} s, to see what is '
-                    'left')
+                    f'after its move: expected at least a period, {period:.3g} s, to measure the '
+                    'remaining error')
         self.knots = np.array(sorted(knots))
         self.bends = _bends(self.knots, [x.begin for x in targets])
         # All levels; those that follow creep change with the last knot before them.

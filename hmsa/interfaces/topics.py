@@ -91,7 +91,8 @@ _TRIGGER = 'std_srvs/srv/Trigger'
 JOINT_TRAJECTORY = Topic(
     '~/joint_trajectory', _TRAJECTORY, RELIABLE,
     'A sequence of setpoints. The actuator leaves the previous point at its `time_from_start` and '
-    'is at rest at `positions` by that of this point. Timestamp 0 starts now; a future timestamp '
+    'is at rest at `positions` no later than the `time_from_start` of this point. Timestamp 0 '
+    'starts now; a future timestamp '
     'keeps the current plan until then; a sequence that began in the past is joined in the '
     'middle. With `trajectory_mode` path, points with `velocities` are a path that is followed to '
     'rest at its end. Points without `positions` and with `effort` are raw levels: the flux '
@@ -112,15 +113,16 @@ STATUS = Topic(
     'setpoint, and the progress of the sequence.', publishers=(PLANNER,))
 OUTCOMES = Topic(
     '~/outcomes', 'diagnostic_msgs/msg/DiagnosticStatus', OUTCOME,
-    'The outcome of each requested setpoint, once it is judged or over, and again if that '
-    'changes; `hardware_id` is the joint, `message` a sentence, and times are in ns. Asked: '
+    'The outcome of each requested setpoint, published once the setpoint is evaluated or over, '
+    'and again if the outcome changes; `hardware_id` is the joint, `message` a sentence, and '
+    'times are in ns. Asked: '
     '`asked` (setpoint, path or levels), `request`, `plan`, `setpoint` of `setpoints`, `target` '
     'and `start` in `coordinate`, `begins`, `end`, and whether it is `held` after that. Planned: '
     '`moves`, a list of begin and arrival as planned first and after each new plan, the last '
-    '`arrival`, and whether it was `corrected` from samples. Over before its time: `ended` '
+    '`arrival`, and whether it was `corrected` from samples. Ended early: `ended` '
     '(replaced, stopped, or the code of the status) at `until`; setpoints that never began share '
     'one outcome, from `setpoint` `through` another. Found: `verdict` and its figures in stretch, '
-    'unless it ended before it could be judged.',
+    'unless the setpoint ended before it could be evaluated.',
     publishers=(PLANNER,))
 ESTIMATE = Topic(
     '~/estimate', 'diagnostic_msgs/msg/DiagnosticArray', RELIABLE,
@@ -153,7 +155,8 @@ FLUX_DENSITY_RECEIVED = Topic(
     publishers=(PLANT, DRIVER), subscribers=(PLANNER,))
 INTERLOCK = Topic(
     '~/interlock', 'std_msgs/msg/Bool', RELIABLE,
-    'An interlock, as of a door or an emergency stop: `true` closes it, `false` opens it. While '
+    'An interlock, such as a door switch or an emergency stop: `true` closes it, `false` opens '
+    'it. While '
     'it is open, the coil is off, and all commands and requests are rejected. It is closed once '
     'all publishers have closed it. Publish it reliably, and repeat it.',
     subscribers=(DRIVER,))
@@ -183,8 +186,8 @@ CLOCK_TOPIC = Topic(
     publishers=(PLANT, PLAYER))
 DIAGNOSTICS = Topic(
     '/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray', RELIABLE,
-    'Counters and health, once a second; by them, a second planner, plant or driver of a joint is '
-    'noticed.', publishers=NODES, subscribers=(PLANNER, PLANT, DRIVER))
+    'Counters and health, once a second. Nodes use them to detect a second planner, plant or '
+    'driver of a joint.', publishers=NODES, subscribers=(PLANNER, PLANT, DRIVER))
 
 FOLLOW = Action(
     '~/follow_joint_trajectory', 'control_msgs/action/FollowJointTrajectory', PLANNER,

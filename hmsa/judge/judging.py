@@ -380,7 +380,7 @@ def _open(
     mend = (f'{less**2:.2g} times as many samples a second, or {less:.2g} times less noise, would '
             'decide it')
     if independent < INDEPENDENT:
-        mend = ('what remains is no noise, so that neither more samples nor less noise would '
+        mend = ('the fit residuals are not noise, so neither more samples nor less noise would '
                 'decide it')
     if 3.0 * sensor.std(setpoint.target) > 0.5 * limits[0]:
         mend = ('a calibrated sensor would decide it: what it shows may be off by '

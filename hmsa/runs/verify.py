@@ -98,7 +98,8 @@ def verify_run(run: Run) -> Verification:
         raise BadInputError(
             f'the timestamps of the samples in {run.path} jump back by '
             f'{back / NANOSECONDS:.3f} s, '
-            'as if the clock of plant or driver had been set: expected times that rise; record a '
+            'as if the clock of the plant or driver had been set: expected increasing times; '
+            'record a '
             'run whose clock is not set')
     begin = int(run.time[window.start])
     notes: list[str] = []

@@ -515,7 +515,7 @@ class AdaptiveJoint:
             self.latest, self.prior.values, plan.level(now).flux_density, target,
             self.start, self.amplitude, use if self.adapts else '')
         return words + (
-            '; the sensor has changed, as far as samples tell, and plans keep '
+            '; the sensor has changed, according to the samples, and plans keep '
             f'{trust.parameters}: check the sensor, or ~/reset_estimate to take it as it is'
             if self.sensor_changed else '')
 

@@ -87,8 +87,8 @@ class Bench:
             time=time_ns(), period=round(NANOSECONDS / rate) if rate else 0, calls=calls), time_ns)
         if not self.worker.started(_START):
             raise HmsaError(
-                f'the hardware has not started within {_START:g} s, or its first write not '
-                'returned: expected one that does')
+                f'the hardware has not started within {_START:g} s, or its first write has not '
+                'returned: expected hardware that does')
         # The newest command, which is repeated as a heartbeat.
         self._newest, self._turn = (0, 0.0), Lock()
         self._over = Event()

@@ -61,7 +61,8 @@ def add_parser(subparsers: Any) -> None:
         ('--settle', 'S', float, 'time at each level before it is read (default 1 s)',
          {'default': 1.0}),
         ('--probe', 'MODULE:NAME', str,
-         'class or function without arguments for the field probe, an object whose read() '
+         'class, or function without arguments, that returns the field probe: an object whose '
+         'read() '
          'returns a flux density in T (default: type the readings, with or without a unit)'),
         ('--hysteresis',
          'also write the hysteresis of an iron core, which the driver then compensates, and '
@@ -75,7 +76,8 @@ def add_parser(subparsers: Any) -> None:
         ('--params-file', 'YAML', Path,
          'parameter file with the sizes of the actuator, and rough values (default: none)'),
         ('--probe', 'MODULE:NAME', str,
-         'class or function without arguments for a field probe, an object whose read() '
+         'class, or function without arguments, that returns a field probe: an object whose '
+         'read() '
          'returns a flux density in T, or a list of (flux density, NaN, time in ns)'),
         ('--lag', 'S', float, 'known time constant of the coil, where there is no probe'),
         ('--out', 'YAML', Path, 'parameter file of driver and planner to write'),
@@ -87,7 +89,8 @@ def add_parser(subparsers: Any) -> None:
         ('--settle', 'S', float,
          'time at each level, of which the second half counts (default 2 s)', {'default': 2.0}),
         ('--gauge', 'MODULE:NAME', str,
-         'class or function without arguments for a gauge, an object whose read() returns the '
+         'class, or function without arguments, that returns a gauge: an object whose read() '
+         'returns the '
          'length of the actuator in the unit of its rest length'),
         ('--out', 'YAML', Path,
          'parameter file of driver and planner to write; the table is written beside it as CSV'),
@@ -98,10 +101,10 @@ def _coil(arguments: argparse.Namespace) -> int:
     """
     Flux density over current, against a field probe.
 
-    Set levels in a loop, from 0 to --limit, to its negative and back, and read a field probe at
-    each: by Python, or typed in. Or evaluate readings in a CSV. Prints the coil constant with its
-    95 % interval, saturation and hysteresis, and writes the settings of the driver. The coil is
-    off at the end, and after Ctrl-C.
+    Set levels from 0 to --limit, to its negative and back, and read a field probe at each level,
+    by a Python class or by hand; or evaluate readings from a CSV. Prints the coil constant with
+    its 95 % interval, saturation and hysteresis, and writes the settings of the driver. The coil
+    is off at the end, and after Ctrl-C.
 
     example: hmsa calibrate coil my_lab:Coil --limit 0.1 --out coil.yaml
     """
@@ -366,9 +369,9 @@ def _static(arguments: argparse.Namespace) -> int:
     Stretch at rest over flux density, and the scale of the sensor.
 
     Hold a slow staircase of levels, from 0 to --limit, to its negative and back. Writes the table
-    of the hyperelastic model "table" for the planner, and the scale of the sensor by which the
-    stretch without a field is 1. With --gauge also its gain and offset. The coil is off at the
-    end, and after Ctrl-C.
+    of the hyperelastic model "table" for the planner, and the scale of the sensor for which the
+    stretch without a field is 1. With --gauge, also writes gain and offset of the sensor. The coil
+    is off at the end, and after Ctrl-C.
 
     example: hmsa calibrate static my_lab:Bench --limit 0.05 --settle 5 --out static.yaml
     """

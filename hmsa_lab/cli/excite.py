@@ -32,7 +32,7 @@ def add_parser(subparsers: Any) -> None:
          'slew_limit (default: the example block)'),
         ('--duration', 'S', float, 'duration in s (default 180 periods of the block)'),
         ('--free', 'NAME,...', str, 'parameters to identify, as in hmsa identify; +modes designs '
-         'a smaller motion that shows those of the parameter file, or two that are expected',
+         'a smaller motion that excites the modes of the parameter file, or two typical ones',
          {'default': ''}),
         ('--stretch-min', 'X', float,
          'minimum stretch (default 0.6; a deflection of -0.6 for a beam)'),

@@ -1,8 +1,9 @@
 """
 Show the running nodes as lines of text, one per second.
 
-A line has stretch, target and flux density of each joint, progress and status of the last request,
-late commands and losses, and what is missing. Quit with Ctrl-C. The panel draws: see hmsa panel.
+Each line contains stretch, target and flux density of each joint, progress and status of the last
+request, late commands, losses and missing nodes or topics. Quit with Ctrl-C. For charts, use hmsa
+panel.
 
 example: hmsa watch --joint actuator
 """

@@ -278,5 +278,5 @@ def _apply(tuning: Tuning, settings: Mapping[str, Any]) -> None:
                              for x, y in changed.items()})
         except BadInputError as error:
             raise HmsaError(
-                f'{tuning.out} is written, and the running planner does not take it ({error}): '
+                f'{tuning.out} is written, but the running planner rejects it ({error}): '
                 f'start it again with --params-file {tuning.out}, then hmsa run') from error

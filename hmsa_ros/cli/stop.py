@@ -2,8 +2,8 @@
 Drop the rest of the sequence and come to rest without vibration.
 
 Have the running planner drop the rest of its sequence and bring the actuators to rest without
-vibration. Return once plant or driver has acknowledged that, and its samples, if any, do not
-contradict it; otherwise fail, and say what is known and what to do. The field stays on: in an
+vibration. Succeed once the plant or driver has acknowledged the stop and its samples, if any, do
+not contradict it. Otherwise fail, and print the state and the remedy. The field stays on: in an
 emergency, open the interlock of the driver (topic driver/interlock), or switch the amplifier off.
 
 example: hmsa stop

@@ -97,8 +97,8 @@ def _evaluate(bag: Path, picture: Path) -> tuple[SetpointResult, ...]:
     if len(part.evaluation.results) != len(SEQUENCE) or len(levels) != 2 * len(SEQUENCE):
         raise HmsaError(
             f'{len(part.evaluation.results)} of {len(SEQUENCE)} setpoints were carried out, with '
-            f'{len(levels)} commands: expected all, with {2 * len(SEQUENCE)}; on a machine so '
-            'busy that commands come late try again')
+            f'{len(levels)} commands: expected all, with {2 * len(SEQUENCE)}; if the machine is '
+            'busy and commands come late, try again')
     found = findings_of(run, Tolerances(LARGEST_RESIDUAL, LARGEST_RESIDUAL, 0.0))
     results = tuple(
         SetpointResult(**asdict(x), finding=found[x.place].to_dict())

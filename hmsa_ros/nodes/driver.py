@@ -150,7 +150,8 @@ class DriverNode(DeviceNode):
                 reconnect=self.values[RECONNECT.name])
             while not self.worker.started(_PATIENCE):
                 self.get_logger().warning(
-                    f'waiting for {name}: it has not started yet, or its first write not returned')
+                    f'waiting for {name}: it has not started yet, or its first write has not '
+                    'returned')
         self.device = self.worker.device
         self.get_logger().info(_described(self.device, self.values))
         self._lock = ros_entities.listen(self, topics.INTERLOCK)

@@ -164,7 +164,8 @@ class Deviations:
         name = 'flux_density_max' if asked > 0.0 else 'flux_density_min'
         words = (
             f'amplifier of joint {joint} saturated: {reached:.4g} T took effect where {asked:.4g} '
-            'T was commanded; nothing beyond that is commanded until the next request; set '
+            'T was commanded; until the next request, no level beyond the reached one is '
+            'commanded; set '
             f'{name} to the limit of the amplifier')
         given = self._saturated.get(joint, (words, options))[1]
         self._saturated[joint] = words, given

@@ -174,8 +174,8 @@ class Stops:
             if self._differs(joint, now) is None:
                 return (
                     f'stop sent, but the plant or driver of joint {joint} sends no receipts '
-                    '(flux_density_received), no applied levels and no samples that rest: whether '
-                    f'it has stopped is not known; see there, or {_SWITCH_OFF}')
+                    '(flux_density_received), no applied levels and no samples that show rest: '
+                    f'the actuator may still move; check it, or {_SWITCH_OFF}')
         if received is not False and self._differs(joint, now):
             return (
                 f'stop sent, but {passed:.1f} s later the newest applied level of joint {joint} '

@@ -70,7 +70,7 @@ def add_parser(subparsers: Any) -> None:
         ('--identified',
          'sample the normal distribution that hmsa identify stored in --params-file'),
         ('--samples', 'N', int, 'number of random samples (default 1024)'),
-        ('--seed', 'S', int, 'of the samples (default 0)', {'default': 0}),
+        ('--seed', 'S', int, 'seed of the random samples (default 0)', {'default': 0}),
         ('--cases', 'FILE.csv', Path,
          'CSV with a header of columns; each row is combined with the samples, and with the '
          'grids of the other columns'),
@@ -84,7 +84,8 @@ def add_parser(subparsers: Any) -> None:
             'processes; 1 computes in this one (default: one a core for large sweeps)'),
         *picture_options(
             'also draw the results: curves over one numeric column, a map with contours over two, '
-            'bands of quantiles for samples; hatched without a plan. A folder as --out always '
+            'bands of quantiles for samples; hatching marks points without a plan. A folder as '
+            '--out always '
             'gets figures, named table', formats='png,pdf'))
 
 

@@ -209,7 +209,7 @@ def _designed(request: MoveRequest) -> Move:
             break
     if not found[1] < before - _NOTHING:
         return replace(chain, reason=chain.reason or (
-            f'no levels leave less than the chain of order {request.order}, which is used'))
+            f'no levels leave less than the cascade of order {request.order}, which is used'))
     return Move(Code.MINIMAX, found[0], chain.duration)
 
 

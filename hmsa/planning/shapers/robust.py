@@ -50,7 +50,7 @@ def robust(request: MoveRequest) -> Move:
     if chain.code is Code.ROBUST and (request.material.creeps or not request.delivery.ideal):
         chain = _chain(request, [*waypoints, request.target])
     return chain if chain.code is Code.ROBUST else replace(move, reason=(
-        f'no chain of order {request.order} leads to {request.named_target} ({chain.code}): '
+        f'no cascade of order {request.order} leads to {request.named_target} ({chain.code}): '
         'a single two-step command is used'))
 
 
