@@ -216,7 +216,7 @@ def test_without_any_report_it_is_said_that_nothing_is_known(monkeypatch):
     stopped_in_the_middle(rig)
     rig.run(rig.now + 5 * SECOND)
     assert outcomes(rig) == ['accepted', 'unheard']
-    assert 'whether it has stopped is not known' in rig.status.verdict.message
+    assert 'the actuator may still move' in rig.status.verdict.message
 
 
 def test_without_a_device_nothing_has_stopped():
