@@ -151,7 +151,7 @@ def test_receipts_are_accepted_after_an_outage_in_which_the_clock_was_set_back(b
     rig.set_device(-back * MS)
     rig.run(rig.now + outage * MS // 2)
     rig.linked = True
-    rig.run(rig.now + 600 * MS)
+    rig.run(rig.now + 650 * MS)
     assert 'no receipt' not in rig.status.unheard
     rig.set_device(back * MS)
     rig.run(rig.now + 1200 * MS)

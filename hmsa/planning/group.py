@@ -108,13 +108,14 @@ class PlannerGroup:
         return self._each(
             self.planners, lambda name: self.planners[name].draft_stop(now))
 
-    def take(self, drafts: Mapping[str, Draft], now: int) -> bool:
-        """Take drafts of one request, made at the same time (ns); return whether there are any."""
+    def take(self, drafts: Mapping[str, Draft], now: int) -> dict[str, Timeline]:
+        """Take drafts of one request, made at the same time (ns); return the new plans."""
+        plans = {}
         for name, draft in drafts.items():
-            self.planners[name].take(draft, now)
+            plans[name] = self.planners[name].take(draft, now)
             self._attempts[name] = 0
         self.number += bool(drafts)
-        return bool(drafts)
+        return plans
 
     def resume(self, name: str, found: Resumption, now: int) -> None:
         """Take the new plan of a joint."""

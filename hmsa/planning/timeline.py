@@ -275,6 +275,12 @@ class PlannedSegment:
         left = '' if self.left is None else self.left.of(self.stretch, self.code)
         return '; '.join(filter(None, (self.reason, left)))
 
+    @property
+    def warns(self) -> bool:
+        """Whether it is reached only roughly: by another command, or worse than by a step."""
+        return (self.code in _WARNINGS or self.code is Code.PATH and bool(self.reason)
+                or self.left is not None and self.left.worse)
+
     def shifted(self, span: int) -> 'PlannedSegment':
         """Return the segment with its times shifted by some ns."""
         return replace(
@@ -337,13 +343,6 @@ class Draft:
     #: Index of the first setpoint of the running plan that is planned again; None for a request.
     resumed: int | None = None
     missed: int = 0  #: number of setpoints skipped because their time is over
-
-    @property
-    def warning(self) -> PlannedSegment | None:
-        """The first setpoint reached only roughly: by another command, or worse than by a step."""
-        return next((x for x in self.segments if x.code in _WARNINGS
-                     or x.code is Code.PATH and x.reason
-                     or x.left is not None and x.left.worse), None)
 
     def delayed(self, delays: Sequence[int]) -> 'Draft':
         """Return the draft with the move of each segment delayed by its delay in ns."""

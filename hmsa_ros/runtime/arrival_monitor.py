@@ -3,7 +3,7 @@
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 from hmsa.interfaces.outcome import LEVELS, Outcome, PATH, REPLACED, SETPOINT, STOPPED
 from hmsa.judge.records import (
@@ -37,6 +37,15 @@ _DROPPED = {
     Code.MISSED: 'plant or driver started after its commands were sent'}
 # What was asked for by the code of its plan.
 _ASKED = {Code.LEVELS: LEVELS, Code.PATH: PATH}
+
+
+class Adopted(NamedTuple):
+    """New plans of a request."""
+
+    request: Request
+    number: int  # of the request in the group
+    time: int  # in ns
+    plans: Mapping[str, Timeline]  # of the joints that it moves
 
 
 @dataclass(eq=False)
@@ -288,6 +297,9 @@ class ArrivalMonitor:
         # Goal tolerances of the newest request by joint, and its name; None for a stop.
         self._goals: Mapping[str, GoalTolerances] = {}
         self._label: str | None = ''
+        self._number = group.number  # number of the newest request
+        #: What is still to be followed, since requests were adopted.
+        self.adopted: list[Adopted] = []
         self._dropped: Code | None = None  # code of the status that drops a plan
         self._joints: dict[str, _Joint] = {}
         # Requests that another replaced, with setpoints that were reached before.
@@ -301,6 +313,7 @@ class ArrivalMonitor:
 
     def restart(self) -> None:
         """Discard all findings; present plans are not judged."""
+        self._catch_up()
         self._opens = None
         for joint in (*self._replaced, *self._joints.values()):
             for hold in joint.holds:
@@ -310,11 +323,6 @@ class ArrivalMonitor:
         for name, planner in self._group.planners.items():
             plan = planner.plan
             self._begin(name, replace(plan, kept=len(plan.segments)), plan)
-
-    def asked(self, request: Request) -> None:
-        """Take name and goal tolerances of a request whose plan has just been adopted."""
-        self._label = None if isinstance(request, Stop) else request.name
-        self._goals = request.goals if isinstance(request, Trajectory) else {}
 
     def dropped(self, code: Code, now: int) -> None:
         """Record that plans that now have no setpoints were dropped, with a code of a status."""
@@ -326,7 +334,7 @@ class ArrivalMonitor:
         """Watch the requested setpoints of a joint."""
         self._joints[name] = _Joint(
             name, name if len(self._group.planners) > 1 else '', self._do, asked, plan,
-            self._group.number, self._label, self._goals.get(name))
+            self._number, self._label, self._goals.get(name))
 
     def _replace(self, name: str, plan: Timeline, now: int) -> None:
         """Watch the setpoints of a new request of a joint instead of the previous ones."""
@@ -349,6 +357,7 @@ class ArrivalMonitor:
 
     def clock_set(self, by: int) -> None:
         """Shift all times by the ns that the clock was set ahead."""
+        self._catch_up()
         for joint in self._watched:
             joint.asked = joint.asked.shifted(by)
             if joint in self._replaced:
@@ -407,20 +416,34 @@ class ArrivalMonitor:
 
     def corrected(self, name: str) -> None:
         """Record that the next plan of a joint is a correction, not a replanning in need."""
+        self._catch_up()
         self._joints[name].corrected = True
 
     def follow(self, now: int) -> None:
         """Watch the setpoints that have started by a time in ns, as requested."""
-        for name, planner in self._group.planners.items():
-            joint, plan = self._joints[name], planner.plan
+        self._catch_up()
+        self._compare({name: x.plan for name, x in self._group.planners.items()}, now)
+        self._open_until(now)
+
+    def _catch_up(self) -> None:
+        """Follow the plans of requests since the last call."""
+        adopted, self.adopted = self.adopted, []
+        for request, number, time, plans in adopted:
+            self._number, self._label = number, None if isinstance(request, Stop) else request.name
+            self._goals = request.goals if isinstance(request, Trajectory) else {}
+            self._compare(plans, time)
+
+    def _compare(self, plans: Mapping[str, Timeline], now: int) -> None:
+        """Watch what is planned now, if it is another plan."""
+        for name, plan in plans.items():
+            joint = self._joints[name]
             if plan.number == joint.plan.number:
                 if plan.segments is not joint.plan.segments:
                     joint.change(plan, now, None if plan.segments else self._dropped)
-            elif self._group.number == joint.request:
+            elif self._number == joint.request:
                 joint.stop(plan, now)
             else:
                 self._replace(name, plan, now)
-        self._open_until(now)
 
     def _open_until(self, time: int) -> None:
         """Watch the setpoints that start by a time in ns."""
@@ -436,6 +459,8 @@ class ArrivalMonitor:
         """Return whether a sample with a timestamp in ns is needed for any joint."""
         steady, wanted = self._around.steady(), False
         self._heard = steady
+        if self.adopted:
+            self.follow(self._around.clock())
         if self._opens is not None and stamp >= self._opens:
             self._open_until(min(stamp, self._around.clock() + AHEAD))
         for joint in self._watched:

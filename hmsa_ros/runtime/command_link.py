@@ -76,7 +76,9 @@ class CommandLink:
     def send(self, now: int, *, everything: bool = False) -> None:
         """Send the levels that are due at a time in ns, or all planned levels."""
         # Commands may arrive although nothing comes back.
-        silent = set() if self.stops() else self.receipts.silent
+        silent = self.receipts.silent
+        if silent and self.stops():
+            silent = set()
         for name, planner in self._planners.items():
             if name in silent | self.apart | self.cut:
                 # The command would arrive too late, apply at another time, or be rejected.

@@ -7,8 +7,8 @@ from hmsa.judge.records import Finding, VERDICTS
 from hmsa.model.status import Code
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.group import PlannerGroup, Progress
-from hmsa.planning.timeline import PlannedSegment
-from hmsa_ros.runtime.arrival_monitor import ArrivalMonitor
+from hmsa.planning.timeline import PlannedSegment, Timeline
+from hmsa_ros.runtime.arrival_monitor import Adopted, ArrivalMonitor
 from hmsa_ros.runtime.deviations import Deviations
 from hmsa_ros.runtime.environment import Environment
 from hmsa_ros.runtime.records import (
@@ -48,6 +48,10 @@ class Reporting:
         # By name of request: the newest verdict, the number of plans then, and the steady time.
         self._answers: dict[str, tuple[Verdict, int, int]] = {}
         self.preview_again: int | None = None  # time in ns of the next part of a long plan
+        # What `flush` is to report: verdicts, each with the numbers of accepted requests, late
+        # commands and replannings then, whether a request was adopted, and a preview.
+        self._pending: list[tuple[Verdict, int, int, int]] = []
+        self._looks_due = self._preview_due = False
         self._reported: tuple[Progress, Mapping[str, Progress], bool] | None = None
         # The plans that progress was computed from, valid until `next_change`.
         self._segments: list[tuple[PlannedSegment, ...]] = []
@@ -80,21 +84,47 @@ class Reporting:
         return self.verdict.severity > Severity.OK and self.verdict.code not in VERDICTS
 
     def report(self) -> None:
-        """Report verdict and progress."""
+        """Have verdict and progress reported by `flush`."""
+        self._pending.append((
+            self.verdict, self._group.number, self._following.lateness.count,
+            self._following.replanned))
+
+    @property
+    def pending(self) -> bool:
+        """Whether there is something for `flush`."""
+        return bool(self._pending or self._preview_due)
+
+    def flush(self) -> None:
+        """
+        Report what there is to report.
+
+        This is apart from the decisions, which do not wait for it.
+        """
+        if not self.pending:
+            return
+        if self._looks_due:
+            self.look_for_listeners()
+        if self._preview_due:
+            self._preview()
+        self._looks_due = self._preview_due = False
+        if not self._pending:
+            return
         self._reported = self._state()
         progress, each, watching = self._reported
         old = self._around.steady() - _REPEATED
         self._answers = {
             name: x for name, x in [*self._answers.items()][-_ANSWERS:] if x[-1] >= old}
-        self.outputs.append(StatusChanged(
-            self.verdict, progress, each, self._group.number, self._following.lateness.count,
-            self._following.replanned, self._watch.findings, self._watch.worst, watching,
-            self.unheard, self.unseen, self._watch.measuring,
-            {name: x.model.units.coordinate for name, x in self._group.planners.items()},
-            {name: x[:2] for name, x in self._answers.items()}))
+        for verdict, number, late, replanned in self._pending:
+            self.outputs.append(StatusChanged(
+                verdict, progress, each, number, late, replanned, self._watch.findings,
+                self._watch.worst, watching, self.unheard, self.unseen, self._watch.measuring,
+                {name: x.model.units.coordinate for name, x in self._group.planners.items()},
+                {name: x[:2] for name, x in self._answers.items()}))
+        self._pending.clear()
 
     def report_progress(self, now: int) -> None:
         """Report the progress if it has changed by a time in ns."""
+        self.flush()
         planners = self._group.planners.values()
         # Progress is unchanged if no plan was replaced and no part of a plan has begun or ended.
         same = (self.next_change is None or now < self.next_change) and all(
@@ -109,9 +139,11 @@ class Reporting:
         self.next_change = self._group.next_change(now)
         return *self._group.progress(now), self._watch.open
 
-    def asked(self, request: Request) -> None:
-        """Have the setpoints of a request judged whose plan has just been adopted."""
-        self._watch.asked(request)
+    def adopted(self, request: Request, plans: Mapping[str, Timeline]) -> None:
+        """Have the setpoints of a request judged that was just given plans, and previewed."""
+        self._watch.adopted.append(Adopted(
+            request, self._group.number, self._around.clock(), plans))
+        self._looks_due, self._preview_due = True, self._preview_due or bool(plans)
 
     def dropped(self, verdict: Verdict) -> None:
         """Report that a plan was dropped before its end."""
@@ -120,6 +152,10 @@ class Reporting:
         self.go_on(verdict, log=True)
 
     def show(self) -> None:
+        """Have the plan previewed by `flush`."""
+        self._preview_due = True
+
+    def _preview(self) -> None:
         """Preview the plan; of a long plan only the beginning, and the rest in time."""
         stamps, samples = self._group.preview(self._around.clock(), _PREVIEW)
         self.preview_again = stamps[_PREVIEW // 2] if len(stamps) == _PREVIEW else None
@@ -131,11 +167,14 @@ class Reporting:
         if judged or worst is None or self.verdict.severity is Severity.ERROR or (
                 not worst.failed and (self._warned or not self._watch.finished)):
             self.report()
-            return
-        fine = worst.arrived or worst.verdict is Code.UNOBSERVED and not self._watch.measuring
-        self.go_on(
-            Verdict(Severity.OK if fine else Severity.WARN, worst.verdict, worst.message),
-            log=worst.failed and worst is finding)
+        else:
+            fine = worst.arrived or (
+                worst.verdict is Code.UNOBSERVED and not self._watch.measuring)
+            self.go_on(
+                Verdict(Severity.OK if fine else Severity.WARN, worst.verdict, worst.message),
+                log=worst.failed and worst is finding)
+        # Before the next finding replaces it.
+        self.flush()
 
     def corrected(self, names: Iterable[str], now: int) -> None:
         """Record that plans were corrected at a time in ns, and preview them soon."""

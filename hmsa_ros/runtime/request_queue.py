@@ -1,21 +1,58 @@
-"""Requests that wait to be planned, and their results."""
+"""
+Requests that wait to be planned, and their results.
+
+A setpoint or a stop is planned at once, in the loop. What takes longer is drafted by a worker
+beside the loop, which goes on sending commands.
+"""
 
 from collections import deque
 from collections.abc import Callable, Mapping
+from functools import partial
+from operator import attrgetter
+from typing import Any
 
 from hmsa.errors import BadInputError, HmsaError
 from hmsa.model.status import Code, RefusedError
+from hmsa.model.units import NANOSECONDS
+from hmsa.planning.drafting import Check
 from hmsa.planning.group import PlannerGroup
-from hmsa.planning.timeline import Draft
+from hmsa.planning.timeline import Draft, PlannedSegment
 from hmsa_ros.runtime.deviations import Deviations
 from hmsa_ros.runtime.environment import Environment
 from hmsa_ros.runtime.follower import Follower
-from hmsa_ros.runtime.planning_task import Drafts, PlanningTask, SLICE, work_on
-from hmsa_ros.runtime.records import Note, Request, Severity, Stop, Verdict
+from hmsa_ros.runtime.planning_task import Drafting, Drafts, FEW, PlanningTask
+from hmsa_ros.runtime.records import (
+    Note,
+    Request,
+    Severity,
+    Stop,
+    StretchRequest,
+    Trajectory,
+    Verdict,
+)
 from hmsa_ros.runtime.reporting import Reporting
+from hmsa_ros.runtime.worker import Inline
 
+#: Duration in ns that the loop waits for drafts before it serves commands and requests.
+SLICE = 4_000_000
+# Number of trajectory points that are read between two checks.
+_READ = 100
+# Factor by which planning may take longer next time than estimated or measured.
+_MARGIN = 3
+# Factor of the planning time until the first commands are sent.
+_READY = 1.5
+_BEGIN = attrgetter('begin')
+_INLINE = Inline()
 # Number of levels and setpoints of replaced plans that are freed at a time.
 _FREED = 2_000
+
+
+class _LateError(Exception):
+    """Drafts that will not be ready in time, and the ns that they need."""
+
+    def __init__(self, needed: int) -> None:
+        super().__init__(needed)
+        self.needed = needed
 
 
 class RequestQueue:
@@ -23,7 +60,7 @@ class RequestQueue:
 
     def __init__(
             self, group: PlannerGroup, following: Deviations, follower: Callable[[], Follower],
-            reporting: Reporting, environment: Environment, send: Callable[[], None],
+            reporting: Reporting, environment: Environment, send: Callable[[int], None],
             stopping: Callable[[str], None]) -> None:
         """Begin without requests; ``stopping`` is called with the name of an adopted stop."""
         self._group, self._following, self._reporting = group, following, reporting
@@ -41,6 +78,14 @@ class RequestQueue:
     def requests(self) -> list[Request]:
         """Requests that have no result yet."""
         return [x.request for x in self._queue if x.request is not None]
+
+    @property
+    def upcoming(self) -> Request | None:
+        """The request that is planned next; None for none."""
+        for work in self._queue:
+            if work.request is not None:
+                return work.request
+        return None
 
     def refuse_all(self, error: HmsaError) -> None:
         """Refuse all waiting requests for the same reason."""
@@ -62,7 +107,14 @@ class RequestQueue:
 
     def add(self, request: Request, *, engaged: bool) -> PlanningTask:
         """Add a checked request; once ``engaged``, one that replaces all others comes first."""
-        work = work_on(request, self._group, lambda drafts: self._follower().cautious(drafts))
+        if isinstance(request, Trajectory):
+            work = _of_trajectory(request, self._group)
+        elif isinstance(request, StretchRequest):
+            work = PlanningTask(frozenset([request.joint]), partial(
+                self._group.draft_setpoint, request.joint, request.stretch), request=request)
+        else:
+            work = PlanningTask(
+                frozenset(self._group.planners), self._group.draft_stop, request=request)
         if engaged and work.replaces(self._queue):
             self._queue.appendleft(work)
         else:
@@ -82,7 +134,7 @@ class RequestQueue:
 
     def work_on(self) -> None:
         """Wait for the plans of waiting work, for the duration of a slice."""
-        for name in self._following.to_resume():
+        for name in self._following.to_resume() if self._following.astray else ():
             if not any(x.request is None and name in x.joints for x in self._queue):
                 self._queue.appendleft(self._following.resumption(name))
         if not self._queue:
@@ -98,10 +150,10 @@ class RequestQueue:
 
     def advance(self, work: PlanningTask, wait: int = SLICE) -> bool:
         """Continue work for some ns; return whether it is done."""
-        begun = self._around.clock() if work.corrects else 0
-        found: tuple[Drafts, int] | None = None
+        begun = self._around.clock()
+        drafts: Drafts | None = None
         try:
-            found = work.advance(self._group, self._around, wait)
+            drafts = self._drafts(work, wait)
         except HmsaError as error:
             if work.corrects:
                 self._reporting.note(f'plan not corrected: {error}')
@@ -112,42 +164,93 @@ class RequestQueue:
             return True
         if work.corrects:
             work.spent += self._around.clock() - begun
-        if found is None:
+        if drafts is None:
             return False
-        planners = [self._group.planners[x] for x in work.joints]
-        plans = [x.plan for x in planners]
+        before = []
+        for name in work.joints:
+            before.append((name, self._group.planners[name].plan))
         if work.request is None:
-            self._go_on(work, *found)
+            self._go_on(work, drafts, work.began + work.later)
         else:
             self._supersede(work)
-            self._answer(work.request, *found)
-        for planner, plan in zip(planners, plans, strict=True):
-            if planner.plan is not plan:
+            self._answer(work.request, drafts, work.began + work.later)
+        for name, plan in before:
+            if self._group.planners[name].plan is not plan:
                 self._leftovers += (*plan.levels, *plan.segments)
         return True
 
-    def _answer(self, request: Request, drafts: Mapping[str, Draft], now: int) -> None:
+    def _drafts(self, work: PlanningTask, wait: int) -> Drafts | None:
+        """
+        Return drafts for the time at which they were begun, or ``later``, if they are in time.
+
+        None if there are none yet, after some ns: they will begin later, or begin again, since the
+        plans have changed meanwhile. Raise `HmsaError` if there will be none.
+        """
+        if work.at_once is None:
+            drafts = self._drafted(work, wait)
+            if drafts is None:
+                return None
+        else:
+            work.began = self._around.clock()
+            drafts = work.at_once(work.began + work.later)
+        if work.request is not None and not isinstance(work.request, Stop):
+            drafts = self._follower().cautious(drafts)
+        spent = self._around.clock() - work.began
+        if not drafts or min(drafts.values(), key=_BEGIN).begin >= work.began + _READY * spent:
+            return drafts
+        work.later = max(_MARGIN * spent, work.later)
+        return None
+
+    def _drafted(self, work: PlanningTask, wait: int) -> Drafts | None:
+        """Wait some ns for the drafts of a worker; return them, complete, or None."""
+        around, planners = self._around, [self._group.planners[x] for x in work.joints]
+        worker = _INLINE if work.brief else around.worker
+        if work.job is None and work.read is not None:
+            work.job = worker.submit(work.read)
+        elif work.job is None:
+            work.began, work.revisions = around.clock(), tuple(x.revision for x in planners)
+            drafting = work.prepare(work.began + work.later)
+            if drafting is None:
+                return {}
+            work.complete = drafting.complete
+            work.job = worker.submit(_bounded(
+                drafting.draft, work, planners[0].options.lead_time, around))
+        if not work.job.done(wait / NANOSECONDS):
+            return None
+        job, work.job = work.job, None
+        if work.read is not None:
+            job.result()
+            work.read = None
+            return None
+        try:
+            drafts: Drafts = job.result()
+        except _LateError as error:
+            work.later = max(_MARGIN * error.needed, 2 * work.later)
+            return None
+        if work.revisions != tuple(x.revision for x in planners):
+            return None
+        return work.complete(drafts)
+
+    def _answer(self, request: Request, drafts: Drafts, now: int) -> None:
         """Start to carry out a request."""
+        # What is still to be reported concerns the plans of before.
+        self._reporting.flush()
         self._following.dropped(drafts)
-        changed = self._group.take(drafts, now)
-        self._reporting.asked(request)
+        plans = self._group.take(drafts, now)
         # Commands are sent first, since reporting takes time.
-        self._send()
-        warnings = [x.warning for x in drafts.values() if x.warning is not None]
-        if changed:
-            self._reporting.show()
-        self._reporting.look_for_listeners()
-        severity, code, words = Severity.OK, Code.ACCEPTED, _accepted(drafts)
+        self._send(self._around.clock())
+        self._reporting.adopted(request, plans)
+        severity, code, words = _accepted(drafts)
         if isinstance(request, Stop):
             self._stopping(request.name)
+        if severity is Severity.OK and isinstance(request, Stop):
             words = (
                 'stopping: comes to rest without vibration; ~/status says once plant or driver '
                 'has acknowledged it')
-        if warnings:
-            severity, code, words = Severity.WARN, warnings[0].code, warnings[0].told
-        elif not changed:
+        if severity is Severity.OK and not plans:
             code, words = Code.UNCHANGED, 'already on the way there: the plan is unchanged'
-        self._reporting.give(Verdict(severity, code, words, request.name), log=bool(warnings))
+        self._reporting.give(
+            Verdict(severity, code, words, request.name), log=severity is not Severity.OK)
 
     def refuse(self, error: HmsaError, request: Request) -> Verdict:
         """Report a request that cannot be read or carried out."""
@@ -163,7 +266,7 @@ class RequestQueue:
         """Adopt a plan that was replanned, or corrected from samples."""
         by = self._follower() if work.corrects else self._following
         verdict = by.take(work, drafts, now)
-        self._send()
+        self._send(self._around.clock())
         if verdict is None:
             return
         if work.corrects:
@@ -174,13 +277,70 @@ class RequestQueue:
             verdict, log=not work.corrects and self._following.replanned_due())
 
 
-def _accepted(drafts: Mapping[str, Draft]) -> str:
-    """Return a message that drafts are accepted, with the vibration that modes and creep leave."""
-    planned = [x for draft in drafts.values() for x in draft.segments]
-    words = ['accepted']
-    ringing = [x for x in planned if x.left is not None]
-    if ringing:
-        words.append(max(ringing, key=lambda x: x.left.vibration if x.left else 0.0).told)
-    if left := max((x.vibration for x in planned), default=0.0):
+def _accepted(drafts: Mapping[str, Draft]) -> tuple[Severity, Code, str]:
+    """Return severity, code and words for drafts, with what modes and creep leave."""
+    ringing: PlannedSegment | None = None
+    most = left = 0.0
+    for draft in drafts.values():
+        for segment in draft.segments:
+            if segment.warns:
+                return Severity.WARN, segment.code, segment.told
+            left = max(left, segment.vibration)
+            if segment.left is not None and (
+                    ringing is None or segment.left.vibration > most):
+                ringing, most = segment, segment.left.vibration
+    words = ['accepted', '' if ringing is None else ringing.told]
+    if left:
         words.append(f'levels that follow creep leave a vibration of up to {left:.1e}')
-    return '; '.join(words)
+    return Severity.OK, Code.ACCEPTED, '; '.join(words if ringing else [words[0], *words[2:]])
+
+
+def _of_trajectory(request: Trajectory, group: PlannerGroup) -> PlanningTask:
+    points: dict[str, list[tuple[Any, int]]] = {name: [] for name in request.joints}
+    path = request.path is not None
+
+    def read(check: Check) -> None:
+        rows = request.points if request.path is None else request.path
+        for number, (stretches, time) in enumerate(rows):
+            for name, stretch in zip(request.joints, stretches, strict=True):
+                points[name].append((stretch, time))
+            if number % _READ == _READ - 1:
+                check()
+
+    def prepare(now: int) -> Drafting:
+        # The times of levels count from the first one.
+        first = next((time for read in points.values() for _, time in read[:1]), 0)
+        later = first if request.raw else 0
+        plans = group.snapshot(lambda x: x.model.on_grid(x.start(None, now) + later) if (
+            request.stamp is None) else x.start(request.stamp + later, now))
+        return Drafting(lambda check: plans.checked(check).draft_request(
+            points, request.stamp, now, raw=request.raw, path=path))
+
+    # The work of a path is not proportional to its number of points.
+    size = 1 if path else request.count * len(request.joints)
+    return PlanningTask(
+        frozenset(request.joints), prepare=prepare, request=request,
+        brief=not path and size <= FEW, size=size, read=read)
+
+
+def _bounded(
+        draft: Callable[[Check], Drafts], work: PlanningTask, lead: int,
+        around: Environment) -> Callable[[Check], Drafts]:
+    """Return drafting that ends as soon as it is clear that it takes too long."""
+    if work.brief or around.one_clock():
+        # The time of the loop does not run with that of the worker.
+        return draft
+    size, later, steady = work.size, work.later, around.steady
+
+    def drafted(check: Check) -> Drafts:
+        begun, done = steady(), 0
+
+        def counted() -> None:
+            nonlocal done
+            check()
+            done += 1
+            spent = steady() - begun
+            if 2 * spent > lead + 2 * later and spent * size > (lead + later) * done:
+                raise _LateError(spent * size // done)
+        return draft(counted)
+    return drafted

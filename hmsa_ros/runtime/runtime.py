@@ -22,7 +22,6 @@ from hmsa_ros.runtime.command_link import CommandLink
 from hmsa_ros.runtime.deviations import Deviations
 from hmsa_ros.runtime.environment import Environment, ObservedSample
 from hmsa_ros.runtime.follower import feedback, Follower
-from hmsa_ros.runtime.planning_task import SLICE
 from hmsa_ros.runtime.receipts import Receipts
 from hmsa_ros.runtime.records import (
     Note,
@@ -31,11 +30,12 @@ from hmsa_ros.runtime.records import (
     Settings,
     Severity,
     Stop,
+    StretchRequest,
     Trajectory,
     Verdict,
 )
 from hmsa_ros.runtime.reporting import LOOK, Reporting
-from hmsa_ros.runtime.request_queue import RequestQueue
+from hmsa_ros.runtime.request_queue import RequestQueue, SLICE
 from hmsa_ros.runtime.sample_timeout import SampleTimeout
 from hmsa_ros.runtime.stops import Stops
 from hmsa_ros.runtime.takeover import Takeover
@@ -98,7 +98,7 @@ class Runtime:
         self.devices.stops = lambda: self._stops.judges
         self.planning = RequestQueue(
             group, self.following, lambda: self.follower, self._reporting,
-            around, lambda: self.devices.send(clock()), self._stops.begin)
+            around, self.devices.send, self._stops.begin)
         self._next_beat = 0  # time in ns of the next heartbeat
         # Time by the steady clock, in ns, by which the caller serves this again; None for any.
         self._next_service: int | None = None
@@ -155,15 +155,17 @@ class Runtime:
                 and not request.follows):
             request = replace(request, path=None)
         self._process_clock()
-        self._check(request)
+        self.devices.since = None
         if not isinstance(request, Stop):
+            self._check_samples(request)
             self.following.asked(request.joints)
         work = self.planning.add(request, engaged=self._takeover.engaged)
         self._engage(begin=True)
-        sure = self._work_on()
-        while sure and work in self.planning and not isinstance(request, Trajectory):
-            # It is short work, and the caller waits for it.
-            sure = self._work_on()
+        while self._may_plan():
+            self.planning.work_on()
+            if work not in self.planning or isinstance(request, Trajectory):
+                # Else, it is short work, and the caller waits for it.
+                break
         if self._set_back:
             # The clock was set back during planning, so the planned times are invalid.
             return self.request(request)
@@ -172,10 +174,9 @@ class Runtime:
             return self.planning.refuse(self.devices.differs(min(self.devices.apart)), request)
         return _WAITING if work in self.planning else self._reporting.verdict
 
-    def _check(self, request: Request) -> None:
-        """Have joints that are to move now checked; a stop does not wait."""
-        self.devices.since = None
-        if isinstance(request, Stop) or not self._takeover.engaged:
+    def _check_samples(self, request: Trajectory | StretchRequest) -> None:
+        """Have joints that are to move now compared with their samples."""
+        if not self._takeover.engaged:
             return
         later = isinstance(request, Trajectory) and request.stamp is not None
         now = self._clock()
@@ -402,7 +403,8 @@ class Runtime:
     def wake(self) -> int | None:
         """Time in ns of the next work; None for never, 0 for now."""
         if (self._set_back or self._stepped or self.planning or self._takeover.waiting
-                or self._outputs or self._listens_until is not None):
+                or self._outputs or self._reporting.pending
+                or self._listens_until is not None):
             return 0
         if not self._takeover.engaged:
             return None
@@ -461,12 +463,13 @@ class Runtime:
     def tick(self, now: int) -> list[Output]:
         """Do the work due at a time in ns, for a few ms at most; return the outputs."""
         self._process_clock()
+        self._reporting.flush()
         if self._listens():
             return self._taken()
         self._engage()
         estimated = self._send(now) and self.follower.update(now)
-        if not estimated:
-            self._work_on()
+        if not estimated and self._may_plan():
+            self.planning.work_on()
         if self._reporting.preview_again is not None and now >= self._reporting.preview_again:
             self._reporting.show()
         self._reporting.report_progress(now)
@@ -480,6 +483,7 @@ class Runtime:
         if (verdict := self._stops.look(now)) is not None:
             self._reporting.give(verdict, log=verdict.severity > Severity.OK)
         self._process_clock()
+        self._reporting.flush()
         return self._taken()
 
     def _send(self, now: int) -> bool:
@@ -489,9 +493,9 @@ class Runtime:
         self.devices.look()
         if self.settings.replan_late:
             self.following.drop_missed(now, self.settings.lateness_tolerance)
-        if self.following.astray:
+        if self.following.astray and self._may_plan():
             # Replan before more of a plan is sent that no longer applies.
-            self._work_on()
+            self.planning.work_on()
         late = self.following.lateness.count
         self.devices.send(now)
         if self.following.lateness.count > late:
@@ -517,12 +521,12 @@ class Runtime:
             self._takeover.begin(self.settings)
         if self._takeover.waiting:
             self._look_at_samples()
-        try:
-            self._takeover.go_on(self.settings)
-        except RefusedError as error:
-            self._takeover.drop()
-            self.planning.refuse_all(error)
-            return
+            try:
+                self._takeover.go_on(self.settings)
+            except RefusedError as error:
+                self._takeover.drop()
+                self.planning.refuse_all(error)
+                return
         if self._takeover.engaged and not engaged:
             self._next_beat = self._clock() + self.settings.heartbeat_period
 
@@ -533,20 +537,13 @@ class Runtime:
         return any(x.next_stamp is not None and x.next_stamp < now
                    for x in self.group.planners.values())
 
-    def _work_on(self) -> bool:
-        """Plan waiting work if the state of the joints is known; return whether it is."""
-        if self._listens() or not self._takeover.engaged or not self._sure():
-            return False
-        self.planning.work_on()
-        return True
-
-    def _sure(self) -> bool:
+    def _may_plan(self) -> bool:
         """Return whether the joints are where predicted, or measured, as far as that matters."""
-        requests = self.planning.requests
-        if not requests and not self.following.astray:
-            return True
-        if requests and isinstance(requests[0], Stop):
-            # It does not wait.
+        if self._listens() or not self._takeover.engaged:
+            return False
+        request = self.planning.upcoming
+        if isinstance(request, Stop) or request is None and not self.following.astray:
+            # A stop does not wait.
             return True
         try:
             if self.devices.must_wait(self.settings):
@@ -557,10 +554,10 @@ class Runtime:
             return False
         try:
             self._look_at_samples()
-            return self._takeover.look(self.settings, keep=not requests)
+            return self._takeover.look(self.settings, keep=request is None)
         except RefusedError as error:
             self.planning.refuse_all(error)
-            return not requests
+            return request is None
 
     def _judge(self, now: int) -> None:
         """Judge arrivals from samples."""
