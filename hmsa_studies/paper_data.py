@@ -15,11 +15,11 @@ import numpy as np
 
 from hmsa.files import replacing
 from hmsa.model.equations import Array, critical_zeta, signed_root, stretch_limits
+from hmsa.model.moves import Setpoint
 from hmsa.model.parameters import NondimensionalParameters
 from hmsa.model.simulation import simulate
 from hmsa.model.status import Code
 from hmsa.planning.sequence import plan_sequence, Segment
-from hmsa.planning.setpoint import Setpoint
 from hmsa.planning.two_step import CODES, Groups, plan_two_step_batch
 
 #: Duration of each setpoint, as stated in the paper.

@@ -12,10 +12,9 @@ from hmsa.errors import BadInputError, HmsaError
 from hmsa.model import law
 from hmsa.model.equations import Array
 from hmsa.model.laws.record import Elastic
-from hmsa.model.moves import Move, State
+from hmsa.model.moves import Move, Setpoint, State
 from hmsa.model.status import Code, RefusedError
 from hmsa.planning.sequence import plan_sequence
-from hmsa.planning.setpoint import Setpoint
 from hmsa.planning.shapers.request import MoveRequest
 from hmsa.planning.two_step import CODES, Groups, plan_two_step_batch
 from hmsa_studies.residual import Actual, arrival_of

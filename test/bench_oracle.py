@@ -12,8 +12,14 @@ from scipy.integrate import solve_ivp
 from hmsa.model.parameters import ActuatorParameters, paper_actuator
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Options, Planner
-from hmsa_ros.runtime.environment import Environment
-from hmsa_ros.runtime.records import EstimateChanged, Send, Settings, StatusChanged, StretchRequest
+from hmsa_ros.runtime.records import (
+    Environment,
+    EstimateChanged,
+    Send,
+    Settings,
+    StatusChanged,
+    StretchRequest,
+)
 from hmsa_ros.runtime.runtime import Runtime
 
 MS = 1_000_000

@@ -15,10 +15,9 @@ from hmsa.model.creep import Creep
 from hmsa.model.delivery import Delivery
 from hmsa.model.equations import elastic_force, natural_frequency
 from hmsa.model.laws import LAWS
-from hmsa.model.moves import Limits
+from hmsa.model.moves import Limits, Setpoint
 from hmsa.model.parameters import NondimensionalParameters
 from hmsa.planning.sequence import plan_sequence
-from hmsa.planning.setpoint import Setpoint
 from hmsa.planning.shapers import SHAPERS
 from hmsa.planning.shapers.request import MoveRequest
 

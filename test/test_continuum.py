@@ -18,13 +18,12 @@ from hmsa.model.actuators import Actuators, Setup
 from hmsa.model.continuum import mounted, spectrum
 from hmsa.model.delivery import Delivery
 from hmsa.model.modes import Modes
-from hmsa.model.moves import Level, State
+from hmsa.model.moves import Level, Setpoint, State
 from hmsa.model.parameters import NondimensionalParameters, paper_actuator
 from hmsa.model.simulation import follow, observed, sampled
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Options, Planner
 from hmsa.planning.sequence import plan_sequence
-from hmsa.planning.setpoint import Setpoint
 from hmsa.planning.shapers import get_shaper
 from hmsa.planning.shapers.request import MoveRequest
 
@@ -284,11 +283,12 @@ def test_minimum_time_that_leaves_more_than_a_step_is_a_warning():
     weak, strong = (
         Planner(BLOCK, Options(shaper='minimum_time', flux_density_min=-x, flux_density_max=x))
         for x in (0.06, 1.0))
-    assert weak.draft_setpoint(1.05, 0).warning is None
+    assert not weak.draft_setpoint(1.05, 0).segments[0].warns
     draft = strong.draft_setpoint(1.05, 0)
+    assert draft.segments[0].warns
     assert re.search(
         r'1\.05 by minimum_time leaves a vibration of \d+ % .* an unshaped step \d+ %: expected '
-        'the shaper modal', draft.warning.told)
+        'the shaper modal', draft.segments[0].told)
     left = draft.segments[0].left
     assert left.vibration > left.step > 0.5
 

@@ -10,13 +10,12 @@ import pytest
 from hmsa.errors import BadInputError
 from hmsa.model.creep import Creep
 from hmsa.model.delivery import Delivery, IDEAL
-from hmsa.model.moves import Limits, State
+from hmsa.model.moves import Limits, Setpoint, State
 from hmsa.model.parameters import NondimensionalParameters, paper_actuator
 from hmsa.model.simulation import follow
 from hmsa.model.status import Code, RefusedError
 from hmsa.planning.planner import Options, Planner
 from hmsa.planning.sequence import plan_sequence
-from hmsa.planning.setpoint import Setpoint
 from hmsa.planning.shapers import get_shaper
 from hmsa.planning.shapers.request import MoveRequest
 from hmsa.planning.two_step import plan_two_step

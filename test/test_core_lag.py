@@ -10,13 +10,12 @@ from scipy.integrate import solve_ivp
 
 from hmsa.model.delivery import Delivery, ramps
 from hmsa.model.equations import elastic_force
-from hmsa.model.moves import Level, Limits, State
+from hmsa.model.moves import Level, Limits, Setpoint, State
 from hmsa.model.parameters import NondimensionalParameters, paper_actuator
 from hmsa.model.simulation import ActuatorSimulation, sampled
 from hmsa.model.status import Code, RefusedError
 from hmsa.planning.planner import Options, Planner
 from hmsa.planning.sequence import plan_sequence
-from hmsa.planning.setpoint import Setpoint
 from hmsa.planning.shapers import get_shaper
 from hmsa.planning.shapers.request import MoveRequest
 

@@ -27,12 +27,11 @@ from hmsa.model.equations import (
     stretch_limits,
 )
 from hmsa.model.laws import LAWS
-from hmsa.model.moves import State
+from hmsa.model.moves import Setpoint, State
 from hmsa.model.parameters import paper_actuator
 from hmsa.model.simulation import simulate
 from hmsa.model.status import Code, RefusedError
 from hmsa.planning.sequence import plan_sequence
-from hmsa.planning.setpoint import Setpoint
 from hmsa.planning.shapers import get_shaper
 from hmsa.planning.shapers.request import MoveRequest
 from hmsa.planning.two_step import Groups, plan_two_step, plan_two_step_batch

@@ -10,12 +10,12 @@ import pytest
 
 from hmsa.errors import BadInputError
 from hmsa.model.equations import elastic_force, natural_frequency
+from hmsa.model.moves import Setpoint
 from hmsa.model.parameters import NondimensionalParameters, paper_actuator
 from hmsa.model.simulation import ActuatorSimulation
 from hmsa.model.status import Code, RefusedError
 from hmsa.planning.planner import Options, Planner
 from hmsa.planning.sequence import plan_sequence
-from hmsa.planning.setpoint import Setpoint
 
 ACTUATOR = paper_actuator()
 GROUP = ACTUATOR.nondimensional

@@ -12,12 +12,11 @@ import pytest
 from hmsa.errors import BadInputError
 from hmsa.model.delivery import Delivery
 from hmsa.model.equations import critical_zeta, natural_frequency, stretch_limits
-from hmsa.model.moves import Limits, State
+from hmsa.model.moves import Limits, Setpoint, State
 from hmsa.model.parameters import NondimensionalParameters
 from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import Units
 from hmsa.planning.sequence import plan_sequence
-from hmsa.planning.setpoint import Setpoint
 from hmsa.planning.shapers.request import MoveRequest
 from hmsa.planning.two_step import plan_two_step
 

@@ -22,13 +22,12 @@ from hmsa.model.equations import (
     natural_frequency,
     stretch_limits,
 )
-from hmsa.model.moves import Limits, Move, State
+from hmsa.model.moves import Limits, Move, Setpoint, State
 from hmsa.model.parameters import NondimensionalParameters, paper_actuator
 from hmsa.model.simulation import ActuatorSimulation, follow
 from hmsa.model.status import Code, RefusedError
 from hmsa.planning.planner import Options, Planner
 from hmsa.planning.sequence import plan_sequence
-from hmsa.planning.setpoint import Setpoint
 from hmsa.planning.shapers import get_shaper, SHAPERS
 from hmsa.planning.shapers.request import MoveRequest
 

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp, trapezoid
 
 from hmsa.errors import BadInputError, HmsaError
 from hmsa.model.equations import damping, elastic_force, energy, equilibrium_stretch, mass
-from hmsa.model.moves import Level, State
+from hmsa.model.moves import Level, Setpoint, State
 from hmsa.model.parameters import NondimensionalParameters, paper_actuator
 from hmsa.model.schedule import CommandSchedule
 from hmsa.model.simulation import (
@@ -21,7 +21,6 @@ from hmsa.model.simulation import (
     simulate,
 )
 from hmsa.planning.sequence import plan_sequence
-from hmsa.planning.setpoint import Setpoint
 
 PAPER = NondimensionalParameters()
 ACTUATOR = paper_actuator()

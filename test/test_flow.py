@@ -18,11 +18,10 @@ from hmsa.interfaces.actuator import creep_from
 from hmsa.model.creep import Creep
 from hmsa.model.delivery import Delivery, IDEAL
 from hmsa.model.flows import FLOWS
-from hmsa.model.moves import Level, State
+from hmsa.model.moves import Level, Setpoint, State
 from hmsa.model.parameters import NondimensionalParameters, paper_actuator
 from hmsa.model.simulation import ActuatorSimulation, follow, sampled, with_followed
 from hmsa.planning.sequence import plan_sequence
-from hmsa.planning.setpoint import Setpoint
 from hmsa.planning.shapers.request import MoveRequest
 from hmsa_lab.adapt.estimator import EstimatorOptions
 from hmsa_lab.adapt.prior import Prior

@@ -11,9 +11,9 @@ from hmsa.model.parameters import paper_actuator
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Options, Planner
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
-from hmsa_ros.runtime.environment import Environment
 from hmsa_ros.runtime.goals import ErrorCode, Goals
 from hmsa_ros.runtime.records import (
+    Environment,
     Send,
     Settings,
     StatusChanged,

@@ -12,8 +12,15 @@ from hmsa.model.parameters import paper_actuator
 from hmsa.model.simulation import ActuatorSimulation
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Options, Planner
-from hmsa_ros.runtime.environment import Environment
-from hmsa_ros.runtime.records import Note, Send, Settings, Severity, StatusChanged, Trajectory
+from hmsa_ros.runtime.records import (
+    Environment,
+    Note,
+    Send,
+    Settings,
+    Severity,
+    StatusChanged,
+    Trajectory,
+)
 from hmsa_ros.runtime.runtime import Runtime
 from hmsa_ros.runtime.weighing import better_than_keeping
 

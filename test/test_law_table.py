@@ -23,11 +23,11 @@ from hmsa.model.equations import (
     stretch_limits,
 )
 from hmsa.model.laws.curve import fitted
+from hmsa.model.moves import Setpoint
 from hmsa.model.parameters import paper_actuator
 from hmsa.model.simulation import simulate
 from hmsa.model.status import Code, RefusedError
 from hmsa.planning.sequence import plan_sequence
-from hmsa.planning.setpoint import Setpoint
 from hmsa.planning.two_step import plan_two_step
 from hmsa.runs.bags import read_runs
 

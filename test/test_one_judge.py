@@ -21,8 +21,8 @@ from hmsa.runs.levels import RecordedLevel
 from hmsa.runs.record import LearntSensor, Run
 from hmsa_ros.device.sensor import SensorErrors
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
-from hmsa_ros.runtime.environment import Environment
 from hmsa_ros.runtime.records import (
+    Environment,
     EstimateChanged,
     Send,
     Settings,

@@ -18,8 +18,7 @@ from hmsa.model.parameters import paper_actuator
 from hmsa.model.status import Code, RefusedError
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Options, Planner
-from hmsa_ros.runtime.environment import Environment
-from hmsa_ros.runtime.records import Settings, Severity, Trajectory
+from hmsa_ros.runtime.records import Environment, Settings, Severity, Trajectory
 from hmsa_ros.runtime.runtime import Runtime
 
 SECOND = 1_000_000_000

@@ -18,8 +18,7 @@ from test_runtime_planner import (
 )
 
 from hmsa.planning.planner import Planner
-from hmsa_ros.runtime.environment import ObservedSample
-from hmsa_ros.runtime.records import Severity, Stop, StretchRequest
+from hmsa_ros.runtime.records import ObservedSample, Severity, Stop, StretchRequest
 
 BEATING = replace(QUIET, heartbeat_period=200 * MS)
 

@@ -13,8 +13,8 @@ from hmsa.model.simulation import ActuatorSimulation
 from hmsa.model.status import Code, RefusedError
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Options, Planner
-from hmsa_ros.runtime.environment import Environment
 from hmsa_ros.runtime.records import (
+    Environment,
     Note,
     PlanChanged,
     Send,

@@ -15,8 +15,7 @@ from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Options, Planner
 from hmsa_ros.device.sensor import SensorErrors
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
-from hmsa_ros.runtime.environment import Environment
-from hmsa_ros.runtime.records import Note, Send, Settings, StatusChanged, Trajectory
+from hmsa_ros.runtime.records import Environment, Note, Send, Settings, StatusChanged, Trajectory
 from hmsa_ros.runtime.runtime import Runtime
 
 MS = 1_000_000

@@ -13,12 +13,11 @@ from hmsa.errors import BadInputError
 from hmsa.model.creep import Creep
 from hmsa.model.delivery import Delivery
 from hmsa.model.laws.record import Elastic, OGDEN, POLYNOMIAL
-from hmsa.model.moves import Limits, State
+from hmsa.model.moves import Limits, Setpoint, State
 from hmsa.model.parameters import NondimensionalParameters, paper_actuator
 from hmsa.model.status import Code, RefusedError
 from hmsa.planning.planner import Options, Planner
 from hmsa.planning.sequence import plan_sequence
-from hmsa.planning.setpoint import Setpoint
 from hmsa.planning.shapers import get_shaper
 from hmsa.planning.shapers.request import MoveRequest
 from hmsa.planning.shapers.smooth_limits import SmoothLimits

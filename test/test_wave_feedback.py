@@ -12,8 +12,7 @@ from hmsa.api.paths import smooth_points, wave_of, wave_path, wave_points
 from hmsa.model.parameters import paper_actuator
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Options, Planner
-from hmsa_ros.runtime.environment import Environment
-from hmsa_ros.runtime.records import Send, Settings, StatusChanged, Stop, Trajectory
+from hmsa_ros.runtime.records import Environment, Send, Settings, StatusChanged, Stop, Trajectory
 from hmsa_ros.runtime.runtime import Runtime
 
 MS, SECOND = 1_000_000, 1_000_000_000

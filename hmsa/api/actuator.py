@@ -43,11 +43,10 @@ from hmsa.interfaces.topics import PLANNER
 from hmsa.model.delivery import IDEAL
 from hmsa.model.equations import Array, critical_zeta, elastic_force, equilibrium_stretch
 from hmsa.model.mismatch import Uncertainty
-from hmsa.model.moves import State
+from hmsa.model.moves import Setpoint, State
 from hmsa.model.parameters import ActuatorParameters
 from hmsa.planning.scales import Scales, scales
 from hmsa.planning.sequence import plan_sequence
-from hmsa.planning.setpoint import Setpoint
 from hmsa.planning.shapers.request import as_errors, ERRORS, MoveRequest
 from hmsa.planning.shapers.smooth_limits import SmoothLimits
 from hmsa.planning.timeline import JointModel

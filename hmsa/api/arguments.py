@@ -15,7 +15,7 @@ from hmsa.errors import BadInputError, excerpt, meant
 from hmsa.interfaces.parameters import ACTUATOR, COIL_TIME_CONSTANT, LAW_NAME
 from hmsa.model.equations import Array
 from hmsa.model.laws import LAWS
-from hmsa.planning.setpoint import impossible
+from hmsa.model.moves import impossible
 
 #: Arguments of `Actuator` of which one describes the damping.
 DAMPED = ('zeta', 'damping_ratio', 'damping_coefficient')

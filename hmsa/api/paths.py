@@ -11,13 +11,12 @@ from hmsa.api.arguments import columns_of, grid_of, number, numbers
 from hmsa.columns import read_table
 from hmsa.errors import BadInputError, excerpt, meant
 from hmsa.model.equations import Array
-from hmsa.model.moves import State
+from hmsa.model.moves import Setpoint, State
 from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.drafting import check_path
 from hmsa.planning.path import along, Path
 from hmsa.planning.sequence import plan_sequence
-from hmsa.planning.setpoint import Setpoint
 from hmsa.planning.shapers.request import MoveRequest
 from hmsa.planning.waves import sampled_shape, Shape, sine, triangle, Wave
 

@@ -158,11 +158,10 @@ def _without_dimension(arguments: argparse.Namespace) -> int:
     """Plan in the units of the paper."""
     from hmsa.api.plan import table_of
     from hmsa.model.equations import signed_root
-    from hmsa.model.moves import State
+    from hmsa.model.moves import impossible, Setpoint, State
     from hmsa.model.status import Code, RefusedError
     from hmsa.model.units import Units
     from hmsa.planning.sequence import plan_sequence
-    from hmsa.planning.setpoint import impossible, Setpoint
     from hmsa.planning.shapers.request import as_errors, ERRORS, MoveRequest
     from hmsa.planning.shapers.smooth_limits import SmoothLimits
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from hmsa.cli.options import argument, Row
 from hmsa.errors import BadInputError
-from hmsa.planning.setpoint import Setpoint
+from hmsa.model.moves import Setpoint
 
 
 def sequence_of(

@@ -22,11 +22,10 @@ from hmsa.model import equations
 from hmsa.model.delivery import Delivery
 from hmsa.model.equations import Array
 from hmsa.model.modes import Modes
-from hmsa.model.moves import Limits, State
+from hmsa.model.moves import Limits, Setpoint, State
 from hmsa.model.parameters import ActuatorParameters, NondimensionalParameters
 from hmsa.model.status import RefusedError
 from hmsa.planning.sequence import plan_sequence
-from hmsa.planning.setpoint import Setpoint
 from hmsa.planning.shapers.request import MoveRequest
 
 if TYPE_CHECKING:

@@ -46,7 +46,12 @@ class Delivery:
 
     def settling(self, change: float) -> float:
         """Return the time (ramp and lag) in which a signed change of the load settles."""
-        return self.ramp(change) + _SETTLED * self.lag
+        return self.ramp(change) + self.lagging
+
+    @property
+    def lagging(self) -> float:
+        """Time in which a lag settles."""
+        return _SETTLED * self.lag
 
     def rounded(self, time: float) -> float:
         """Return a time, possibly infinite, rounded to a multiple of the resolution."""

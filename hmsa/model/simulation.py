@@ -212,7 +212,7 @@ def _follow_slowly(
     rings, amplifier = end, last if delivery.lag > 0.0 else None
     if material.creeps:
         rings = min(end, max(pieces[-1][0], 0.0) + longest_motion(last, material)
-                    + delivery.settling(0.0))
+                    + delivery.lagging)
     stretch, rate, field, *followed = _sampled(
         pieces, state, np.array([float(rings)]), material, delivery.lag)[:, 0].tolist()
     if rings == end:

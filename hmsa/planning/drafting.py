@@ -13,13 +13,12 @@ from typing import Any
 import numpy as np
 
 from hmsa.errors import BadInputError
-from hmsa.model.moves import Level, Move, State
+from hmsa.model.moves import impossible, Level, Move, Setpoint, State
 from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.history import agree
 from hmsa.planning.path import along, ON_PATH, Path
 from hmsa.planning.sequence import Segment, segments
-from hmsa.planning.setpoint import impossible, Setpoint
 from hmsa.planning.shapers import SHAPERS
 from hmsa.planning.shapers.free import through
 from hmsa.planning.shapers.request import MoveRequest, Shaper
@@ -352,6 +351,8 @@ def draft_moves(
     for segment in segments(
             _frame(model, outset.state), setpoints, SHAPERS[shaper or model.options.shaper],
             model.options.short_spell, first=first):
+        if placed:
+            outset.check()
         more, one = _placed(model, outset.begin, outset.check, segment)
         levels += more
         placed.append(one)
@@ -361,7 +362,6 @@ def draft_moves(
             levels += outset.plan.levels[place:]
             placed += planned[following:]
             break
-        outset.check()
     return Draft(outset.begin, tuple(levels), tuple(placed))
 
 

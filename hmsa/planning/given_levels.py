@@ -10,10 +10,10 @@ from dataclasses import replace
 import math
 
 from hmsa.model.equations import equilibrium_stretch, stretch_limits
+from hmsa.model.moves import Setpoint
 from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.drafting import check_times, draft_moves, PlanStart
-from hmsa.planning.setpoint import Setpoint
 from hmsa.planning.timeline import Draft, JointModel, PlannedLevel, PlannedSegment
 
 # Fraction of the range from rest to the limits of the model that a motion may use.

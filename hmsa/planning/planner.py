@@ -13,6 +13,7 @@ import math
 
 from hmsa.errors import BadInputError
 from hmsa.model.equations import equilibrium_stretch
+from hmsa.model.moves import Setpoint
 from hmsa.model.parameters import ActuatorParameters
 from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import NANOSECONDS
@@ -20,7 +21,6 @@ from hmsa.planning import drafting
 from hmsa.planning.drafting import Check, PathPoint, PlanStart, proceed
 from hmsa.planning.given_levels import check_levels, draft_levels
 from hmsa.planning.running import RunningPlan
-from hmsa.planning.setpoint import Setpoint
 from hmsa.planning.timeline import Draft, JointModel, Options, Timeline
 
 __all__ = ['Options', 'Planner']
@@ -118,7 +118,7 @@ class Planner(RunningPlan):
         continues; with a past one the sequence is joined in the middle. The draft is None if the
         request changes nothing. Raise `RefusedError` if it cannot be carried out.
         """
-        drafting.check_points(points, self.model.material.rest, self.check)
+        drafting.check_points(points, self.model.rest, self.check)
         base, outset = self._begin(stamp, now)
         return drafting.draft_sequence(outset, points, base, now)
 
@@ -148,13 +148,13 @@ class Planner(RunningPlan):
         ``stamp`` and errors are those of `draft_request`. Where limits keep the actuator from the
         path, it follows as near as they allow, and the draft has a warning.
         """
-        drafting.check_path(points, self.model.material.rest)
+        drafting.check_path(points, self.model.rest)
         base, outset = self._begin(stamp, now)
         return drafting.draft_path(outset, points, base, now)
 
     def draft_setpoint(self, stretch: float, now: int) -> Draft | None:
         """Draft a move to one stretch; None if it changes nothing."""
-        drafting.check_target(stretch, self.model.material.rest)
+        drafting.check_target(stretch, self.model.rest)
         begin = self.soonest(now)
         if self.plan.ends_at(stretch, begin):
             return None
@@ -187,7 +187,7 @@ class Planner(RunningPlan):
     def draft_path_anew(
             self, begin: int, model: JointModel, believed: Believed | None) -> Draft:
         """Draft the rest of the running path again with a model, from an estimated state."""
-        return drafting.draft_path_anew(self._from(begin, model, believed))
+        return drafting.draft_path_anew(self._outset(begin, model, believed))
 
     def draft_trim(self, now: int, flux_density: float) -> Draft:
         """Draft a corrected level in T that holds the current setpoint, from rest."""
@@ -221,10 +221,12 @@ class Planner(RunningPlan):
         begin = self.start(stamp, now)
         return begin if stamp is None else stamp, self._outset(begin)
 
-    def _outset(self, begin: int) -> PlanStart:
-        return self._from(begin, self.model, self.believed(begin + self.delay))
-
-    def _from(self, begin: int, model: JointModel, believed: Believed | None) -> PlanStart:
+    def _outset(
+            self, begin: int, model: JointModel | None = None,
+            believed: Believed | None = None) -> PlanStart:
+        """Return the start of a draft; ``believed`` is given together with another model."""
+        if model is None:
+            model, believed = self.model, self.believed(begin + self.delay)
         state = model.taken_from(self._delayed(begin), self.model)
         if believed is not None:
             state = replace(

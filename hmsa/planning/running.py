@@ -164,19 +164,15 @@ class RunningPlan:
 
     def due(self, now: int) -> tuple[PlannedLevel, ...]:
         """Return the commands to send now, each once: those up to lead_time ahead."""
-        first, latest = self._history.sent, now + self.model.options.lead_time
-        levels = self._history.plan.levels
+        history, latest = self._history, now + self.model.options.lead_time
+        first, levels = history.sent, history.plan.levels
         if first == len(levels) or levels[first].stamp > latest:
             return ()
         end = bisect_right(levels, latest, first, key=STAMP)
-        self._catch_up(end)
-        self._history = replace(self._history, sent=end)
-        return self.plan.levels[first:end]
-
-    def _catch_up(self, end: int) -> None:
-        """Predict levels up to an index again, as far as their prediction is no longer valid."""
-        if self._history.stale is not None:
-            self._history = self._history.predicted(end)
+        if history.stale is not None:
+            history = history.predicted(end)
+        self._history = replace(history, sent=end)
+        return history.plan.levels[first:end]
 
     def moves(self, now: int) -> bool:
         """Return whether setpoints are still to be reached at a time in ns."""
@@ -292,7 +288,8 @@ class RunningPlan:
     def state(self, time: int) -> State:
         """Predict the nondimensional state at a time in ns, in the units of the next request."""
         place = self.plan.place(time)
-        self._catch_up(place + 1)
+        if self._history.stale is not None:
+            self._history = self._history.predicted(place + 1)
         level = self.plan.levels[place]
         if time < level.stamp and self._past:
             before = bisect_right(self._past, time, key=STAMP) - 1

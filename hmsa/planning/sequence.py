@@ -12,13 +12,12 @@ from hmsa.model import law
 from hmsa.model.delivery import Delivery, ramps
 from hmsa.model.equations import elastic_force, natural_frequency
 from hmsa.model.laws.record import ENDLESS
-from hmsa.model.moves import Level, Move, State
+from hmsa.model.moves import Level, Move, Setpoint, State
 from hmsa.model.parameters import NondimensionalParameters
 from hmsa.model.simulation import follow, longest_motion, sampled
 from hmsa.model.status import Code, RefusedError
 from hmsa.motion import STRETCH
 from hmsa.planning.remaining import Remaining, remaining
-from hmsa.planning.setpoint import Setpoint
 from hmsa.planning.shapers import creeping, get_shaper
 from hmsa.planning.shapers.request import MoveRequest, Shaper, StepBudget
 
@@ -201,7 +200,7 @@ def _follow(request: MoveRequest, move: Move, span: float) -> State:
             return State(
                 request.target, 0.0, last, last if delivery.lag > 0.0 else None,
                 (request.target, 0.0) * len(material.modes.ratios))
-        end = min(end, ramped + longest_motion(last, material) + delivery.settling(0.0))
+        end = min(end, ramped + longest_motion(last, material) + delivery.lagging)
     return follow(move.levels, start, end, material, delivery)
 
 

@@ -77,6 +77,7 @@ class JointModel:
     delivery: Delivery = field(init=False)  #: dimensionless, like limits and pace
     pace: SmoothLimits = field(init=False)
     pull: float = field(init=False)  #: load of the constant force
+    rest: float = field(init=False)  #: position at rest without a field
 
     def __post_init__(self) -> None:
         """Compute the dimensionless data."""
@@ -100,6 +101,7 @@ class JointModel:
                 options.creep_tolerance),
             'pace': replace(options.pace, rate=options.pace.rate * time),
             'pull': pull,
+            'rest': actuator.rest,
         }
         for name, value in worked_out.items():
             object.__setattr__(self, name, value)

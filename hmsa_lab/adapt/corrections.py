@@ -32,9 +32,8 @@ from hmsa_lab.adapt.learnt import as_of_path, initial_state, learnt_model, same_
 from hmsa_lab.adapt.messages import confounded
 from hmsa_lab.adapt.motion import rest
 from hmsa_lab.adapt.move_errors import Moves
-from hmsa_ros.runtime.environment import Clock
 from hmsa_ros.runtime.planning_task import PlanningTask, Replanning, replanning
-from hmsa_ros.runtime.records import Severity, Verdict
+from hmsa_ros.runtime.records import Clock, Severity, Verdict
 from hmsa_ros.runtime.weighing import LEAST_STEP, step_of
 
 if TYPE_CHECKING:

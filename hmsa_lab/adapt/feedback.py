@@ -14,10 +14,9 @@ from hmsa_lab.adapt.adaptive_joint import AdaptiveJoint, RESTING
 from hmsa_lab.adapt.corrections import Corrections
 from hmsa_lab.adapt.learnt import same_parameters, save
 from hmsa_lab.adapt.messages import differences
-from hmsa_ros.runtime.environment import Clock
 from hmsa_ros.runtime.follower import Follower
 from hmsa_ros.runtime.planning_task import Drafts, PlanningTask
-from hmsa_ros.runtime.records import EstimateChanged, Output, Settings, Severity, Verdict
+from hmsa_ros.runtime.records import Clock, EstimateChanged, Output, Settings, Severity, Verdict
 
 # Interval in ns at which the estimate is published.
 _REPORT = 200_000_000

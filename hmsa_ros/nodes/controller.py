@@ -23,8 +23,7 @@ from hmsa_ros.nodes.planner import PlannerNode
 from hmsa_ros.nodes.plant import PlantNode
 from hmsa_ros.nodes.runner import run
 from hmsa_ros.runtime.cycles import Cycles
-from hmsa_ros.runtime.environment import ObservedSample
-from hmsa_ros.runtime.records import Output, Send
+from hmsa_ros.runtime.records import ObservedSample, Output, Send
 from hmsa_ros.timekeeping import steady_ns
 
 # Time in ns that must remain of a period to publish one more message; limit on waiting messages.

@@ -33,7 +33,7 @@ from hmsa_ros.nodes.parameters import declare_joints
 from hmsa_ros.nodes.planning import group_from, models_from, OWN, settings_from, SPECS
 from hmsa_ros.nodes.runner import run
 from hmsa_ros.runtime import records
-from hmsa_ros.runtime.environment import Environment, ObservedSample
+from hmsa_ros.runtime.records import Environment, ObservedSample
 from hmsa_ros.runtime.runtime import Runtime
 from hmsa_ros.runtime.worker import PlanningThread
 from hmsa_ros.timekeeping import steady_ns, StepWatch

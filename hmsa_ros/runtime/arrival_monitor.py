@@ -21,9 +21,8 @@ from hmsa.model.status import Code
 from hmsa.offload import Awaited, Doing
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.timeline import PlannedSegment, Timeline
-from hmsa_ros.runtime.environment import Environment
 from hmsa_ros.runtime.follower import Follower
-from hmsa_ros.runtime.records import Request, Stop, Trajectory
+from hmsa_ros.runtime.records import Environment, Request, Stop, Trajectory
 
 # Largest age of the newest sample for further samples to be expected, by the steady clock.
 _RECENT = 10_000_000_000
@@ -290,9 +289,11 @@ class ArrivalMonitor:
 
     def __init__(
             self, group: PlannerGroup, environment: Environment,
-            follower: Callable[[], Follower], publish: Callable[[Outcome], None]) -> None:
+            follower: Follower, publish: Callable[[Outcome], None]) -> None:
         """Begin without setpoints; ``publish`` is called with each outcome."""
-        self._group, self._around, self._follower = group, environment, follower
+        self._group, self._around = group, environment
+        #: Estimates the sensors; feedback may take its place.
+        self.follower = follower
         self._publish = publish
         # Goal tolerances of the newest request by joint, and its name; None for a stop.
         self._goals: Mapping[str, GoalTolerances] = {}
@@ -353,7 +354,7 @@ class ArrivalMonitor:
 
     def _do(self, *work: Any) -> Awaited[Any]:
         """Execute judging where feedback executes its work."""
-        return self._follower().do(*work)
+        return self.follower.do(*work)
 
     def clock_set(self, by: int) -> None:
         """Shift all times by the ns that the clock was set ahead."""
@@ -500,12 +501,12 @@ class ArrivalMonitor:
                 if (steady := self._around.steady()) >= until:
                     return None
                 found = hold.judge(
-                    now, steady, tolerances, self._follower().sensor(joint.key),
+                    now, steady, tolerances, self.follower.sensor(joint.key),
                     observable=observable)
                 if hold.news:
                     hold.news = False
                     if current:
-                        self._follower().audit(joint.key, hold)
+                        self.follower.audit(joint.key, hold)
                 if found is not None:
                     # Also before it is over: the planner or a recording may end.
                     self._tell(joint, hold.requested, found)

@@ -5,8 +5,7 @@ from time import monotonic_ns, thread_time_ns
 import numpy as np
 from numpy.typing import NDArray
 
-from hmsa_ros.runtime.environment import Clock
-from hmsa_ros.runtime.records import Severity
+from hmsa_ros.runtime.records import Clock, Severity
 
 # Number of cycles whose CPU times are stored.
 _REMEMBERED = 4096

@@ -35,6 +35,8 @@ _UNSEEN, _SILENT = 2 * NANOSECONDS, 10 * NANOSECONDS
 _PAUSE = 20_000_000
 # Time in ns until receipts show why commands are late; there are five a second.
 _CAUSE = 400_000_000
+# Number of commands per joint whose sending time is stored.
+_REMEMBERED = 64
 
 
 @dataclass
@@ -68,6 +70,8 @@ class Deviations:
         # By joint: accumulated unplanned vibration, and time in ns of the next evaluation.
         self._strayed: dict[str, float] = {}
         self._again: dict[str, int] = {}
+        # By joint and timestamp in ns: when a command was sent.
+        self._sent: dict[str, dict[int, int]] = {}
         # Messages about saturated amplifiers, and the limits as given.
         self._saturated: dict[str, tuple[str, Options]] = {}
         # Joints that may deviate, and the timestamp of the unconfirmed command.
@@ -123,7 +127,11 @@ class Deviations:
 
     def sent(self, joint: str, stamp: int, now: int) -> None:
         """Record that a command was sent."""
-        self.lateness.sent(joint, stamp, now)
+        sent = self._sent.setdefault(joint, {})
+        sent.pop(stamp, None)
+        sent[stamp] = now
+        if len(sent) > _REMEMBERED:
+            del sent[next(iter(sent))]
         if stamp < now:
             self.lateness.missed(now - stamp, self._receipts.steady)
             self._report_advice()
@@ -141,9 +149,12 @@ class Deviations:
         step = step_of(planner.plan, planner.plan.under_way(stamp))
         cost = 2.0 * found.effect / step
         if not found.foreign:
+            due = stamp - found.late
+            sent = self._sent.get(joint, {}).get(due)
             self.lateness.note(
-                found.late, joint, stamp - found.late, tolerance,
-                2.0 * planner.vibration(1, found.change) / step, self._receipts.steady)
+                found.late, joint, due, tolerance,
+                2.0 * planner.vibration(1, found.change) / step, self._receipts.steady,
+                None if sent is None else due - sent)
             for other in self._group.planners.values():
                 other.delay = self.lateness.expected
         self._strayed[joint] = self._strayed.get(joint, 0.0) + cost

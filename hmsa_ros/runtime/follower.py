@@ -10,9 +10,8 @@ from hmsa.offload import Awaited, Doing, here
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.timeline import JointModel
 from hmsa.plugins import FOLLOWER, registered
-from hmsa_ros.runtime.environment import Clock
 from hmsa_ros.runtime.planning_task import Drafts, PlanningTask
-from hmsa_ros.runtime.records import Output, Settings, Verdict
+from hmsa_ros.runtime.records import Clock, Output, Settings, Verdict
 
 
 class Follower:

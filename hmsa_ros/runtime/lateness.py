@@ -16,8 +16,6 @@ _ENOUGH = 3
 # A command is an exception if it differs by more than this many times the usual spread; smallest
 # fraction of commands that are none.
 _APART, _MOST = 5.0, 0.6
-# Number of commands per joint whose sending time is stored.
-_REMEMBERED = 64
 # Time in ns after a disturbance within which late commands are due to it; number of disturbances.
 _AFTER, _DISTURBANCES = 500_000_000, 16
 # The driver causes the delay if the spread of the lateness is below this fraction of that of the
@@ -61,37 +59,27 @@ class Lateness:
         self.earliest = 0  # largest time in ns by which a command was early
         self._missed = False
         self._effects: dict[str, int] = {}  # time of effect of the newest command, in ns
-        self._sent: dict[str, dict[int, int]] = {}
         # Lateness in ns, and vibration per ns of lateness, as a fraction of the step.
         self._recent: deque[tuple[int, float]] = deque(maxlen=_RECENT)
         self._late: deque[_Late] = deque(maxlen=_RECENT)
         self._needed = 0  # largest lateness in ns of forgotten commands, without disturbances
         self._disturbances: deque[Disturbance] = deque(maxlen=_DISTURBANCES)
 
-    def sent(self, joint: str, stamp: int, now: int) -> None:
-        """Record when a command was sent; times in ns."""
-        sent = self._sent.setdefault(joint, {})
-        sent.pop(stamp, None)
-        sent[stamp] = now
-        if len(sent) > _REMEMBERED:
-            del sent[next(iter(sent))]
-
     def note(
             self, late: int, joint: str, stamp: int, tolerance: int = 0,
-            cost: float = 0.0, time: int = 0) -> None:
+            cost: float = 0.0, time: int = 0, ahead: int | None = None) -> None:
         """
         Record that a command of a joint took effect ``late`` ns after its timestamp.
 
         ``cost`` is the vibration per ns of lateness, as a fraction of the step; ``time`` that of
-        the steady clock.
+        the steady clock; ``ahead`` that from sending to the timestamp, if known.
         """
         before, self._effects[joint] = self._effects.get(joint), stamp + late
         if late < 0 or before is None or stamp + late > before + tolerance:
             # A command that arrives with the previous one was delayed together with it.
             self._recent.append((late, cost))
         if late > tolerance:
-            sent = self._sent.get(joint, {}).get(stamp)
-            self._add(_Late(time, late, None if sent is None else stamp - sent))
+            self._add(_Late(time, late, ahead))
         elif late < -tolerance:
             self.earliest = max(self.earliest, -late)
 

@@ -11,8 +11,7 @@ from typing import Protocol
 from hmsa.model.equations import Array
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.group import PlannerGroup
-from hmsa_ros.runtime.environment import Environment
-from hmsa_ros.runtime.records import Output, Send, Settings
+from hmsa_ros.runtime.records import Environment, Output, Send, Settings
 from hmsa_ros.runtime.runtime import Runtime
 
 # Time to wait, in ns, while the controller waits for something.

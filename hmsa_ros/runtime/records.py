@@ -1,16 +1,18 @@
-"""Inputs and outputs of a planner runtime."""
+"""What goes into a planner at work, what comes out, and what it asks its caller."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Any, TYPE_CHECKING
+from typing import Any, NamedTuple, TYPE_CHECKING
 
-from hmsa.errors import BadInputError
+from hmsa.errors import BadInputError, excerpt
 from hmsa.interfaces.outcome import Outcome
 from hmsa.judge.records import Finding, GoalTolerances, Tolerances
-from hmsa.model.status import Code
+from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.group import Progress
+from hmsa_ros.runtime.worker import Inline, Worker
+from hmsa_ros.timekeeping import steady_ns
 
 if TYPE_CHECKING:
     from hmsa.identification.known import Known
@@ -118,6 +120,58 @@ class Stop:
 Request = Trajectory | StretchRequest | Stop
 
 
+def check_request(
+        request: Request, joints: Sequence[str], settings: Settings, now: int, *,
+        active: bool) -> None:
+    """
+    Check that a request can be accepted at a time in ns.
+
+    Raises `RefusedError` if the planner is inactive or has no time, if a joint is unknown,
+    repeated or missing, or if there are too many setpoints.
+    """
+    if not active:
+        raise RefusedError(
+            Code.INACTIVE, 'the planner is inactive: expected it active (ros2 lifecycle set NODE '
+            'activate)')
+    if now == 0:
+        raise RefusedError(
+            Code.NO_TIME,
+            'simulated time has not started: expected messages on /clock (start the simulator, or '
+            'set use_sim_time to false)')
+    if isinstance(request, StretchRequest) and request.joint not in joints:
+        raise RefusedError(
+            Code.UNKNOWN_JOINT, f'joint {request.joint!r}: expected one of {", ".join(joints)}')
+    if not isinstance(request, Trajectory):
+        return
+    names = request.joints
+    if not request.count:
+        # A stop of all joints.
+        if unknown := [x for x in names if x not in joints]:
+            raise _unknown(f'has {excerpt(unknown[0])}: expected names among {", ".join(joints)}')
+        return
+    if len(joints) == 1 and names != tuple(joints):
+        raise _unknown(f'is {excerpt(list(names))}: expected {list(joints)}')
+    if twice := sorted({x for x in names if names.count(x) > 1}):
+        raise _unknown(f'has {excerpt(twice[0])} twice: expected each joint once')
+    if unknown := [x for x in names if x not in joints]:
+        raise _unknown(f'has {excerpt(unknown[0])}: expected names among {", ".join(joints)}')
+    missing = [x for x in joints if x not in names]
+    if not names or missing and not settings.allow_partial_joints:
+        raise _unknown(
+            f'lacks {missing[0]!r}: expected all of {", ".join(joints)} (set '
+            'allow_partial_joints to let a message name only some of them)')
+    count = request.count * len(names)
+    if count > settings.max_points:
+        raise RefusedError(
+            Code.TOO_LONG,
+            f'the trajectory has {count} setpoints: expected at most {settings.max_points}, the '
+            'parameter max_points; send it in parts, each with its start as timestamp')
+
+
+def _unknown(reason: str) -> RefusedError:
+    return RefusedError(Code.UNKNOWN_JOINT, f'joint_names {reason}')
+
+
 # -- out ----------------------------------------------------------------------------------------
 
 class Severity(IntEnum):
@@ -199,3 +253,48 @@ class EstimateChanged:
 
 
 Output = Send | PlanChanged | StatusChanged | Note | EstimateChanged | Outcome
+
+
+# -- the caller -----------------------------------------------------------------------------------
+
+#: Returns the time in ns of the clock of timestamps.
+Clock = Callable[[], int]
+
+
+class ObservedSample(NamedTuple):
+    """A sample of a joint."""
+
+    stamp: int  # in ns
+    stretch: float
+    rate: float  # in 1/s
+    flux_density: float  # in T
+    lag: int | None = None  # age at arrival in ns; None if all nodes share a clock
+    came: int = 0  # time of arrival, in ns by the steady clock; 0 for now
+
+
+@dataclass
+class Environment:
+    """
+    Queries to the caller of a planner; times in ns.
+
+    The first request waits for samples, if a publisher may provide them, and for a subscriber that
+    carries out commands.
+    """
+
+    clock: Clock  #: clock of the timestamps and of `hmsa_ros.runtime.runtime.Runtime.tick`
+    steady: Clock = steady_ns  #: clock of timeouts and slices
+    worker: Worker = field(default_factory=Inline)  #: plans requests
+    #: Whether all nodes share one clock, such as simulated time.
+    one_clock: Callable[[], bool] = bool
+    #: Whether there may be a publisher of samples.
+    observable: Callable[[], bool] = lambda: True
+    #: Why commands are not carried out; empty if they are.
+    unheard: Callable[[], str] = str
+    #: Whether a joint has a device that reports.
+    found: Callable[[str], bool] = lambda joint: True
+    #: Whether the device of a joint gives receipts.
+    reports: Callable[[str], bool] = lambda joint: False
+    #: Identifiers of the publishers of applied levels of a joint.
+    reporters: Callable[[str], frozenset[bytes]] = lambda joint: frozenset()
+    #: New samples by joint, which requests are checked against.
+    glance: Callable[[], Iterable[tuple[str, ObservedSample]]] = tuple

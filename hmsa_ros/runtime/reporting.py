@@ -10,8 +10,8 @@ from hmsa.planning.group import PlannerGroup, Progress
 from hmsa.planning.timeline import PlannedSegment, Timeline
 from hmsa_ros.runtime.arrival_monitor import Adopted, ArrivalMonitor
 from hmsa_ros.runtime.deviations import Deviations
-from hmsa_ros.runtime.environment import Environment
 from hmsa_ros.runtime.records import (
+    Environment,
     Output,
     PlanChanged,
     Request,
@@ -100,7 +100,7 @@ class Reporting:
 
         This is apart from the decisions, which do not wait for it.
         """
-        if not self.pending:
+        if not (self._pending or self._preview_due):
             return
         if self._looks_due:
             self.look_for_listeners()

@@ -18,10 +18,10 @@ from hmsa.planning.drafting import Check
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.timeline import Draft, PlannedSegment
 from hmsa_ros.runtime.deviations import Deviations
-from hmsa_ros.runtime.environment import Environment
 from hmsa_ros.runtime.follower import Follower
 from hmsa_ros.runtime.planning_task import Drafting, Drafts, FEW, PlanningTask
 from hmsa_ros.runtime.records import (
+    Environment,
     Note,
     Request,
     Severity,
@@ -59,12 +59,13 @@ class RequestQueue:
     """Have waiting requests planned, and report the results."""
 
     def __init__(
-            self, group: PlannerGroup, following: Deviations, follower: Callable[[], Follower],
+            self, group: PlannerGroup, following: Deviations, follower: Follower,
             reporting: Reporting, environment: Environment, send: Callable[[int], None],
             stopping: Callable[[str], None]) -> None:
         """Begin without requests; ``stopping`` is called with the name of an adopted stop."""
         self._group, self._following, self._reporting = group, following, reporting
-        self._follower = follower
+        #: Follows the joints; feedback may take its place.
+        self.follower = follower
         self._around, self._send, self._stopping = environment, send, stopping
         self._queue: deque[PlanningTask] = deque()
         # Parts of replaced plans: freeing all at once takes tens of ms.
@@ -138,7 +139,7 @@ class RequestQueue:
             if not any(x.request is None and name in x.joints for x in self._queue):
                 self._queue.appendleft(self._following.resumption(name))
         if not self._queue:
-            self._queue += self._follower().due(self._around.clock())
+            self._queue += self.follower.due(self._around.clock())
         del self._leftovers[-_FREED:]
         end = self._around.steady() + SLICE
         while self._queue and (left := end - self._around.steady()) > 0:
@@ -194,7 +195,7 @@ class RequestQueue:
             work.began = self._around.clock()
             drafts = work.at_once(work.began + work.later)
         if work.request is not None and not isinstance(work.request, Stop):
-            drafts = self._follower().cautious(drafts)
+            drafts = self.follower.cautious(drafts)
         spent = self._around.clock() - work.began
         if not drafts or min(drafts.values(), key=_BEGIN).begin >= work.began + _READY * spent:
             return drafts
@@ -264,7 +265,7 @@ class RequestQueue:
 
     def _go_on(self, work: PlanningTask, drafts: Mapping[str, Draft], now: int) -> None:
         """Adopt a plan that was replanned, or corrected from samples."""
-        by = self._follower() if work.corrects else self._following
+        by = self.follower if work.corrects else self._following
         verdict = by.take(work, drafts, now)
         self._send(self._around.clock())
         if verdict is None:

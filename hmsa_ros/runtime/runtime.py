@@ -17,14 +17,15 @@ from hmsa.planning import path
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.timeline import JointModel
 from hmsa_ros.runtime.arrival_monitor import ArrivalMonitor
-from hmsa_ros.runtime.checks import check_joints, check_ready
 from hmsa_ros.runtime.command_link import CommandLink
 from hmsa_ros.runtime.deviations import Deviations
-from hmsa_ros.runtime.environment import Environment, ObservedSample
 from hmsa_ros.runtime.follower import feedback, Follower
 from hmsa_ros.runtime.receipts import Receipts
 from hmsa_ros.runtime.records import (
+    check_request,
+    Environment,
     Note,
+    ObservedSample,
     Output,
     Request,
     Settings,
@@ -80,13 +81,11 @@ class Runtime:
         receipts = Receipts(around.steady)
         self.following = Deviations(group, receipts, self._note)
         self.follower = Follower(group, settings)
-        self._follow()
         self._takeover = Takeover(
             group.planners, around, receipts, self.following.newest,
             self._follows, self._note)
         self._silence = SampleTimeout(around)
-        self._watch = ArrivalMonitor(
-            group, around, lambda: self.follower, self._outputs.append)
+        self._watch = ArrivalMonitor(group, around, self.follower, self._outputs.append)
         self.devices = CommandLink(
             group.planners, receipts, self.following, self._takeover, around, self._outputs)
         self._reporting = Reporting(
@@ -97,8 +96,9 @@ class Runtime:
             lambda: self.settings.tolerances)
         self.devices.stops = lambda: self._stops.judges
         self.planning = RequestQueue(
-            group, self.following, lambda: self.follower, self._reporting,
-            around, self.devices.send, self._stops.begin)
+            group, self.following, self.follower, self._reporting, around, self.devices.send,
+            self._stops.begin)
+        self._follow()
         self._next_beat = 0  # time in ns of the next heartbeat
         # Time by the steady clock, in ns, by which the caller serves this again; None for any.
         self._next_service: int | None = None
@@ -116,6 +116,7 @@ class Runtime:
             self.follower = feedback(
                 self.group, self.settings, self._outputs, self._clock, self._report_ended,
                 self.follower.doing)
+            self.planning.follower = self._watch.follower = self.follower
 
     def _follows(self, joint: str) -> bool:
         return self.follower.follows(joint)
@@ -140,8 +141,9 @@ class Runtime:
             self._reporting.report()
             return self._reporting.verdict
         try:
-            check_ready(self._clock(), active=self.active)
-            check_joints(request, tuple(self.group.planners), self.settings)
+            check_request(
+                request, tuple(self.group.planners), self.settings, self._clock(),
+                active=self.active)
             if isinstance(request, Trajectory) and not request.count:
                 # As for a joint_trajectory_controller; goals are checked before.
                 request = Stop(request.name)
@@ -157,7 +159,8 @@ class Runtime:
         self._process_clock()
         self.devices.since = None
         if not isinstance(request, Stop):
-            self._check_samples(request)
+            if self._takeover.engaged:
+                self._compare_samples(request)
             self.following.asked(request.joints)
         work = self.planning.add(request, engaged=self._takeover.engaged)
         self._engage(begin=True)
@@ -174,10 +177,8 @@ class Runtime:
             return self.planning.refuse(self.devices.differs(min(self.devices.apart)), request)
         return _WAITING if work in self.planning else self._reporting.verdict
 
-    def _check_samples(self, request: Trajectory | StretchRequest) -> None:
+    def _compare_samples(self, request: Trajectory | StretchRequest) -> None:
         """Have joints that are to move now compared with their samples."""
-        if not self._takeover.engaged:
-            return
         later = isinstance(request, Trajectory) and request.stamp is not None
         now = self._clock()
         self._look_at_samples()
@@ -516,18 +517,18 @@ class Runtime:
 
     def _engage(self, *, begin: bool = False) -> None:
         """Start from the actual state of the joints, as soon as it is known."""
-        engaged = self._takeover.engaged
-        if begin:
-            self._takeover.begin(self.settings)
-        if self._takeover.waiting:
+        if self._takeover.engaged:
+            return
+        engaged = begin and self._takeover.begin(self.settings)
+        if not engaged and self._takeover.waiting:
             self._look_at_samples()
             try:
-                self._takeover.go_on(self.settings)
+                engaged = self._takeover.go_on(self.settings)
             except RefusedError as error:
                 self._takeover.drop()
                 self.planning.refuse_all(error)
                 return
-        if self._takeover.engaged and not engaged:
+        if engaged:
             self._next_beat = self._clock() + self.settings.heartbeat_period
 
     @property

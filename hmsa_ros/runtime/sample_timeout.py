@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from hmsa.model.units import NANOSECONDS
-from hmsa_ros.runtime.environment import Environment
+from hmsa_ros.runtime.records import Environment
 
 # Longest gap between samples: in ns by the steady clock, and in sampling intervals.
 _PATIENCE, _INTERVALS = 2 * NANOSECONDS, 3

@@ -9,8 +9,7 @@ from hmsa.planning.group import PlannerGroup
 from hmsa.planning.timeline import ALWAYS
 from hmsa_ros.runtime.arrival_monitor import ArrivalMonitor
 from hmsa_ros.runtime.command_link import CommandLink
-from hmsa_ros.runtime.environment import Environment
-from hmsa_ros.runtime.records import Severity, Verdict
+from hmsa_ros.runtime.records import Environment, Severity, Verdict
 
 # Time in ns by the steady clock, after the planned rest, until a stop counts as not acknowledged:
 # receipts arrive five times a second, and a busy machine delays them.

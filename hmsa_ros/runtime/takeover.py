@@ -8,9 +8,8 @@ from hmsa.errors import BadInputError, HmsaError
 from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.planner import Planner
-from hmsa_ros.runtime.environment import Environment, ObservedSample
 from hmsa_ros.runtime.receipts import Receipts
-from hmsa_ros.runtime.records import Settings
+from hmsa_ros.runtime.records import Environment, ObservedSample, Settings
 from hmsa_ros.runtime.stillness import Stillness
 
 # Largest age of a sample that shows where a joint is, in ns by the steady clock; and of one that
@@ -65,14 +64,19 @@ class Takeover:
         """Whether it is waiting for samples."""
         return self._until is not None or self._look_until is not None
 
-    def begin(self, settings: Settings) -> None:
-        """Wait for samples if there is a publisher of them, or if discovery is not complete."""
-        if self.engaged or self._until is not None:
-            return
-        if settings.takeover_timeout and (self._around.observable() or self._around.unheard()):
-            self._until = self._around.steady() + settings.takeover_timeout
-        else:
-            self.engaged = True
+    def begin(self, settings: Settings) -> bool:
+        """
+        Begin with the prediction, or wait for samples; return whether it is ``engaged``.
+
+        It waits if there is a publisher of samples, or if discovery is not complete.
+        """
+        if self._until is None and not self.engaged:
+            if settings.takeover_timeout and (
+                    self._around.observable() or self._around.unheard()):
+                self._until = self._around.steady() + settings.takeover_timeout
+            else:
+                self.engaged = True
+        return self.engaged
 
     def observe(self, joint: str, seen: ObservedSample) -> None:
         """Record a sample; ignore unknown joints, unknown values and samples out of order."""
@@ -109,14 +113,14 @@ class Takeover:
             name: x._replace(stamp=x.stamp + by) for name, x in self._samples.items()}
         self._still.clear()
 
-    def go_on(self, settings: Settings) -> None:
+    def go_on(self, settings: Settings) -> bool:
         """
         Start from the samples available, once there is nothing more to wait for.
 
-        Raises `RefusedError` for samples of another clock.
+        Returns whether it does. Raises `RefusedError` for samples of another clock.
         """
         if self._until is None:
-            return
+            return False
         now = self._around.clock()
         samples = {
             name: x for name, x in self._samples.items()
@@ -132,7 +136,7 @@ class Takeover:
                 samples[name] = seen
         samples = {name: y for name, x in samples.items() if (y := self._complete(name, x))}
         if not over and (len(samples) < len(self._planners) or self._around.unheard()):
-            return
+            return False
         self._until, self.engaged = None, True
         observable = self._around.observable()
         for name in self._planners:
@@ -143,6 +147,7 @@ class Takeover:
                     (f'samples of joint {name} contain no rate, and do not show rest'
                      if name in self._samples else f'no sample of joint {name} on joint_states')
                     + ': it is assumed at rest where it began (initial_stretch)')
+        return True
 
     def _complete(self, name: str, seen: ObservedSample) -> ObservedSample | None:
         """Return a sample with a rate, which is zero if the joint is seen to rest; else None."""

@@ -8,12 +8,11 @@ quantities are dimensionless; `Units` only format the messages.
 import math
 
 from hmsa.errors import BadInputError, meant
-from hmsa.planning.shapers.advice import advised
 from hmsa.planning.shapers.linear import ei, step, zv, zvd
 from hmsa.planning.shapers.minimax import minimax
 from hmsa.planning.shapers.minimum_time import minimum_time
 from hmsa.planning.shapers.modal import modal
-from hmsa.planning.shapers.request import Shaper
+from hmsa.planning.shapers.request import advised, Shaper
 from hmsa.planning.shapers.robust import robust
 from hmsa.planning.shapers.smooth import smooth
 from hmsa.planning.shapers.two_step import two_step
