@@ -196,8 +196,8 @@ class LockedBench(Bench):
 def test_a_planner_drops_its_plan_refuses_and_waits_to_be_asked(reaction, monkeypatch):
     rig = LockedBench(settings=replace(BEATING, after_cut_off=reaction))
     received = rig.runtime.received
-    monkeypatch.setattr(rig.runtime, 'received', lambda *x, cut_off: received(
-        *x, cut_off=cut_off, locked=rig.door))
+    monkeypatch.setattr(rig.runtime, 'received', lambda *x, **others: received(
+        *x, **others, locked=rig.door))
     rig.runtime.request(trajectory((1.2, 400 * MS), (1.4, 60_000 * MS)))
     rig.run(START + 800 * MS)
     rig.open_door()
