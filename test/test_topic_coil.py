@@ -108,7 +108,7 @@ def test_a_recorder_of_the_topic_is_no_node_that_serves_the_coil(ros, make_ros, 
     ros.node.create_service(Trigger, '~/split_bagfile', lambda _, response: response)
     ros.collect(FIELD, '/field')
     with monkeypatch.context() as patched:
-        patched.setattr('hmsa_lab.nodes.topic_coil._PATIENCE', 0.5)
+        patched.setattr('hmsa_lab.nodes.topic_coil._PATIENCE', 1.5)
         with pytest.raises(BadInputError, match='no node subscribes to /field'):
             load('topic', 'left', {'topic': '/field'})
     server = make_ros(namespace='/bench')

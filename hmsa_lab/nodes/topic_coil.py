@@ -25,9 +25,9 @@ from hmsa_ros.nodes.temporary_node import leave, visit
 # In s: wait for a subscriber at the start, interval of checks then and later (each takes 0.1 ms),
 # wait for the last acknowledgement.
 _PATIENCE, _LOOK, _AGAIN, _LAST = 8.0, 0.02, 0.25, 0.3
-# Time in s for which a subscriber counts before the coil is used: the services by which a recorder
-# is known are discovered after its subscriptions.
-_KNOWN = 0.2
+# Times in s for which a subscriber counts before the coil is used, if a service of its node is
+# discovered, as by those a recorder is known, and if not: a node need not have any.
+_KNOWN, _BARE = 0.2, 1.0
 # Tolerance of the length of a direction, and maximum length of an array.
 _ROUNDED, _LONGEST = 1e-3, 4096
 
@@ -55,7 +55,7 @@ class _SharedTopic:
             while monotonic() < until:
                 if not self.matched:
                     since = monotonic()
-                elif monotonic() - since >= _KNOWN:
+                elif self._discovered(monotonic() - since):
                     break
                 sleep(_LOOK)
                 if not type_name:
@@ -75,6 +75,14 @@ class _SharedTopic:
     def matched(self) -> bool:
         """Whether there is a subscriber other than recorders."""
         return self._publisher is not None and ros_entities.heard(self._node, self._publisher)
+
+    def _discovered(self, seconds: float) -> bool:
+        """Return whether the nodes that have subscribed for some s are discovered as a whole."""
+        if seconds < _KNOWN:
+            return False
+        serving = {x.rpartition('/')[0] for x, _ in self._node.get_service_names_and_types()}
+        return seconds >= _BARE or serving.issuperset(
+            ros_entities.subscribers_of(self._node, self._publisher.topic_name).values())
 
     def _require_subscriber(self) -> None:
         if not self.matched:
