@@ -78,11 +78,9 @@ class _SharedTopic:
 
     def _discovered(self, seconds: float) -> bool:
         """Return whether the nodes that have subscribed for some s are discovered as a whole."""
-        if seconds < _KNOWN:
-            return False
-        serving = {x.rpartition('/')[0] for x, _ in self._node.get_service_names_and_types()}
-        return seconds >= _BARE or serving.issuperset(
-            ros_entities.subscribers_of(self._node, self._publisher.topic_name).values())
+        return seconds >= _BARE or seconds >= _KNOWN and ros_entities.servers(
+            self._node).issuperset(
+                ros_entities.subscribers_of(self._node, self._publisher.topic_name).values())
 
     def _require_subscriber(self) -> None:
         if not self.matched:

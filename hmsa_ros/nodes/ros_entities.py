@@ -74,11 +74,15 @@ def subscribers_of(node: Node, topic: str) -> dict[bytes, str]:
     return _names(node.get_subscriptions_info_by_topic(node.resolve_topic_name(topic)))
 
 
+def servers(node: Node, service: str = '') -> set[str]:
+    """Return the full names of nodes with a private service, or with any."""
+    return {x.rpartition('/')[0] for x, _ in node.get_service_names_and_types()
+            if x.endswith(service)}
+
+
 def recorders(node: Node) -> set[str]:
     """Return the full names of recorders, including those of rosbag2, which also split bags."""
-    return {
-        service.rpartition('/')[0] for service, _ in node.get_service_names_and_types()
-        if service.endswith('/split_bagfile')}
+    return servers(node, '/split_bagfile')
 
 
 def heard(node: Node, publisher: Publisher) -> bool:
