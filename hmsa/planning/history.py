@@ -71,7 +71,7 @@ class History:
         return 0
 
     @property
-    def awaiting(self) -> bool:
+    def awaiting_change(self) -> bool:
         """Whether a change of level that was sent has not been reported yet."""
         return self._changes(range(self.known + 1, self.sent)) > 0
 

@@ -274,7 +274,7 @@ class RunningPlan:
     @property
     def awaiting_change(self) -> bool:
         """Whether one of these levels is another than the one in force."""
-        return self._history.awaiting
+        return self._history.awaiting_change
 
     def unknown(self, now: int) -> tuple[PlannedLevel, tuple[PlannedLevel, ...]]:
         """Return the last level known to apply by a time in ns, and the levels after it."""
