@@ -99,7 +99,7 @@ class NondimensionalParameters:
     @cached_property
     def creeps(self) -> bool:
         """Whether there are viscoelastic branches with a stiffness above 0."""
-        return any(self.creep.ratios)
+        return bool(self.creep)
 
     @cached_property
     def limits(self) -> tuple[float, float]:

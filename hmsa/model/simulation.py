@@ -135,7 +135,7 @@ def with_followed(
 def observed(rows: Array, material: NondimensionalParameters) -> Array:
     """Return stretch and rate of all modes together from rows of `sampled`, shape (2, m)."""
     seen = rows[:motion.FIELD]
-    if not material.modes.ratios:
+    if not material.modes:
         return seen
     after = motion.FOLLOWED + len(material.branches)
     return np.array(material.observed(seen[0], seen[1], rows[after:]))
@@ -259,7 +259,7 @@ def longest_motion(load: float, material: NondimensionalParameters) -> float:
     frequency = law.natural_frequency(stretch, material.packed)
     longest = _MOST_PERIODS * 2.0 * math.pi / frequency
     decay = law.damping(stretch, material.packed) / (2.0 * law.mass(stretch, material.packed))
-    if material.modes.ratios:
+    if material.modes:
         decay = min(decay, frequency * material.modes.slowest_decay())
     if decay == 0.0:
         return longest

@@ -89,7 +89,7 @@ def plan_two_step(
             f'start {start!r}, target {target!r}, rate {rate!r}: expected finite numbers')
     if not 1e-14 <= rtol <= 1e-4:
         raise BadInputError(f'rtol is {rtol!r}: expected 1e-14 to 1e-4')
-    if material.creep.ratios and material.creep:
+    if material.creeps:
         raise BadInputError(
             'the group has Maxwell branches: expected one without, or plan_sequence for one that '
             'creeps')
