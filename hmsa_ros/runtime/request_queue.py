@@ -8,7 +8,6 @@ beside the loop, which goes on sending commands.
 from collections import deque
 from collections.abc import Callable, Mapping
 from functools import partial
-from operator import attrgetter
 from typing import Any
 
 from hmsa.errors import BadInputError, HmsaError
@@ -41,7 +40,6 @@ _READ = 100
 _MARGIN = 3
 # Factor of the planning time until the first commands are sent.
 _READY = 1.5
-_BEGIN = attrgetter('begin')
 _INLINE = Inline()
 # Number of levels and setpoints of replaced plans that are freed at a time.
 _FREED = 2_000
@@ -83,10 +81,7 @@ class RequestQueue:
     @property
     def upcoming(self) -> Request | None:
         """The request that is planned next; None for none."""
-        for work in self._queue:
-            if work.request is not None:
-                return work.request
-        return None
+        return next((x.request for x in self._queue if x.request is not None), None)
 
     def refuse_all(self, error: HmsaError) -> None:
         """Refuse all waiting requests for the same reason."""
@@ -167,15 +162,13 @@ class RequestQueue:
             work.spent += self._around.clock() - begun
         if drafts is None:
             return False
-        before = []
-        for name in work.joints:
-            before.append((name, self._group.planners[name].plan))
+        before = {x: self._group.planners[x].plan for x in work.joints}
         if work.request is None:
             self._go_on(work, drafts, work.began + work.later)
         else:
             self._supersede(work)
             self._answer(work.request, drafts, work.began + work.later)
-        for name, plan in before:
+        for name, plan in before.items():
             if self._group.planners[name].plan is not plan:
                 self._leftovers += (*plan.levels, *plan.segments)
         return True
@@ -197,7 +190,7 @@ class RequestQueue:
         if work.request is not None and not isinstance(work.request, Stop):
             drafts = self.follower.cautious(drafts)
         spent = self._around.clock() - work.began
-        if not drafts or min(drafts.values(), key=_BEGIN).begin >= work.began + _READY * spent:
+        if not drafts or min(x.begin for x in drafts.values()) >= work.began + _READY * spent:
             return drafts
         work.later = max(_MARGIN * spent, work.later)
         return None
