@@ -22,7 +22,7 @@ line. Nothing here depends on ROS; ``hmsa_ros`` contains the nodes.
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-__version__ = '0.1.0'
+__version__ = '0.2.0'
 
 if TYPE_CHECKING:
     from hmsa.api.actuator import Actuator

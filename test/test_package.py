@@ -107,11 +107,13 @@ def test_package_xml_and_setup_py_describe_the_same_package(setup, manifest):
         element.get('email') for element in manifest.findall('maintainer')]
 
 
-def test_version_is_the_same_in_the_package_and_the_changelog(setup):
+def test_version_is_the_same_in_the_package_the_citation_and_the_changelog(setup):
     assert setup['version'] == hmsa.__version__
-    versions = re.findall(
-        r'^(\d+\.\d+\.\d+) \(.+\)\n-+$', (ROOT / 'CHANGELOG.rst').read_text(), re.M)
-    assert versions[0] == hmsa.__version__
+    released = re.findall(
+        r'^(\d+\.\d+\.\d+) \((\d{4}-\d\d-\d\d)\)\n-+$', (ROOT / 'CHANGELOG.rst').read_text(), re.M)
+    citation = yaml.safe_load((ROOT / 'CITATION.cff').read_text(encoding='utf-8'))
+    assert (citation['version'], str(citation['date-released'])) == released[0]
+    assert released[0][0] == hmsa.__version__
 
 
 def test_licence_is_the_one_in_the_licence_file(setup, manifest):
@@ -126,6 +128,8 @@ def test_licence_is_the_one_in_the_licence_file(setup, manifest):
 def test_package_xml_asks_for_ament_python_in_format_3(manifest):
     assert manifest.get('format') == '3'
     assert texts(manifest, 'export/build_type') == ['ament_python']
+    # rosdep has no key for a compiler, and build farms always have one.
+    assert texts(manifest, 'build_depend') == ['python3-dev']
 
 
 def test_package_xml_and_setup_py_require_the_same_python_packages(setup, manifest):
