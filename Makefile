@@ -13,7 +13,7 @@ PYTHONS ?= python3.10 python3.11 python3.12 python3.13 python3.14
 BIN := $(VENV)/bin
 PYTEST := $(BIN)/python -m pytest -n auto --dist loadgroup --no-loadscope-reorder
 # Bytecode is written when a module is first imported, not for all of them now.
-INSTALL := $(BIN)/python -m pip install --disable-pip-version-check --quiet --no-compile \
+INSTALL := $(BIN)/python scripts/narrate.py $(BIN)/python -m pip install --disable-pip-version-check --no-compile \
 	-c constraints$(if $(filter-out jazzy,$(ROS)),-$(ROS)).txt
 # Of the package that is installed: to install it again would compile the motion again.
 EXTRAS := $(BIN)/python scripts/list_extras.py
@@ -124,8 +124,8 @@ $(VENV)/.installed: setup.py setup.cfg pyproject.toml package.xml $(wildcard con
 	"Ubuntu: python3-dev)" >&2; exit 1; }
 	@command -v c++ >/dev/null || { echo "hmsa_ros: no C++ compiler (c++): install one; on Debian" \
 	"and Ubuntu: apt install g++" >&2; exit 1; }
-	@echo "Making the environment $(VENV), which takes some minutes the first time"
-	$(PYTHON) -m venv --clear $(VENV)
+	@echo "Making the environment $(VENV) with ROS 2 and all requirements: up to some minutes the first time"
+	$(PYTHON) scripts/narrate.py $(PYTHON) -m venv --clear $(VENV)
 	$(INSTALL) -e '.[$(ROS)]'
 	@touch $@ $(VENV)/.motion
 
@@ -154,7 +154,7 @@ $(VENV)/.control_msgs: $(wildcard test/action_interfaces/* test/action_interface
 $(VENV)/.motion: $(wildcard hmsa/*.c hmsa_lab/bench/*.cpp \
 	hmsa_lab/bench/hmsa_board/*.hpp hmsa/judge/*.cpp hmsa/motion/*.cpp hmsa/motion/hmsa/*.hpp) | $(VENV)/.installed
 	@test -e $@ && test -z "$$(find $^ -newer $@)" \
-	|| { echo "Compiling the motion"; $(BIN)/python setup.py --quiet build_ext --inplace; }
+	|| { echo "Compiling the motion"; $(BIN)/python scripts/narrate.py $(BIN)/python setup.py build_ext --inplace; }
 	@touch $@
 
 # An environment whose Python does not start (moved, or its base removed) is made anew too.

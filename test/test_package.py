@@ -1,10 +1,12 @@
 """Consistency of the package's descriptions: setup.py, package.xml, constraints and files."""
 
 import ast
+from concurrent.futures import ThreadPoolExecutor
 from importlib import import_module
 import json
 from pathlib import Path
 import re
+import runpy
 import subprocess
 import sys
 from typing import Any
@@ -263,6 +265,28 @@ def test_every_file_that_names_the_supported_pythons_names_the_same():
     workflow = yaml.safe_load((ROOT / '.github' / 'workflows' / 'ci.yml').read_text())
     matrix = workflow['jobs']['gate']['strategy']['matrix']
     assert matrix['python'] == list(PYTHONS)
+
+
+def test_an_installation_says_what_it_does_and_ends_as_its_command_does(
+        tmp_path, capfd, wait_until):
+    narrate = runpy.run_path(str(ROOT / 'scripts' / 'narrate.py'))['main']
+    goes_on, said = tmp_path / 'goes_on', []
+    command = (
+        'import pathlib, sys, time\n'
+        "print('Collecting numpy', flush=True)\n"
+        f'while not pathlib.Path({str(goes_on)!r}).exists(): time.sleep(0.01)\n'
+        'sys.exit(3)')
+    with ThreadPoolExecutor() as threads:
+        ended = threads.submit(narrate, [sys.executable, '-c', command], 0.05)
+
+        def heard():
+            said.extend(capfd.readouterr().out.splitlines())
+            return any(re.fullmatch(r'  Collecting numpy, \d+ s', x) for x in said)
+
+        wait_until(heard)
+        goes_on.touch()
+        assert ended.result() == 3
+    assert 'Collecting numpy\n' in capfd.readouterr().err
 
 
 def test_the_workflow_runs_the_gate_and_the_gate_runs_what_the_readme_types():
