@@ -75,16 +75,20 @@ def compare(*, quick: bool = False, runs: int = RUNS) -> Sheet:
         for x in figures.values()), strict=True))
     return Sheet(
         'identification',
-        f'Root mean square error over the Cramer-Rao bound, and coverage of the 95 % intervals in '
-        f'%, over G, c, J_lim, Br and bias; {runs} runs of 2 s each, start values with errors of '
-        f'30 %, sensor gain given. All parameters together, {wide} of the {len(rows)} rows cover '
-        f'more than {100.0 * LARGEST_COVERAGE:.0f} % and {narrow} less than '
-        f'{100.0 * LEAST_COVERAGE:.0f} %. '
-        f'Limits that allow for chance: ratio {ratio:.2f} for {LARGEST_RATIO:g}, coverage '
-        f'{100.0 * least:.0f} and {100.0 * most:.0f} for {100.0 * LEAST_COVERAGE:.0f} and '
-        f'{100.0 * LARGEST_COVERAGE:.0f}',
+        f'Accuracy of G, c, J_lim, Br and bias in {runs} runs of 2 s each',
         ['sequence, noise, rate', 'error over bound', 'coverage [%]', 'all [%]',
-         'not identified', 'processor [ms]'], rows, figures, passed)
+         'not identified', 'processor [ms]'], rows, figures, passed, [
+             'Start values have errors of 30 %. The sensor gain is given.',
+             '*Error over bound*: root mean square error over the Cramer-Rao bound, from the best '
+             f'to the worst parameter. With {runs} runs, a limit of {LARGEST_RATIO:g} allows '
+             f'{ratio:.2f} by chance.',
+             '*Coverage*: fraction of the 95 % intervals that contain the true value, from the '
+             f'worst to the best parameter. Limits of {100.0 * LEAST_COVERAGE:.0f} and '
+             f'{100.0 * LARGEST_COVERAGE:.0f} % allow {100.0 * least:.0f} to '
+             f'{100.0 * most:.0f} % by chance.',
+             f'*All*: the same over all parameters. {wide} of the {len(rows)} rows are above '
+             f'{100.0 * LARGEST_COVERAGE:.0f} %, and {narrow} below '
+             f'{100.0 * LEAST_COVERAGE:.0f} %.'])
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,12 +214,16 @@ def robustness(*, quick: bool = False, runs: int = ROBUST_RUNS) -> Sheet:
         figures[kind] = {'verdicts': counts, 'runs': runs, 'row': row, 'biases': biases.tolist()}
     return Sheet(
         'identification_robustness',
-        f'{runs} runs each of 2 s at 1 kHz, unshaped steps repeated, noise 0.001; bias (of the '
-        f'worst parameter; {1.0 / np.sqrt(runs):.2f} by chance) and error in reported standard '
-        'deviations; width of the intervals and change of the result relative to white noise '
-        'alone',
+        f'Disturbed recordings: {runs} runs each of 2 s at 1 kHz, repeated unshaped steps, noise '
+        '0.001',
         ['disturbance', 'identified / not identifiable / rejected', 'bias', 'error, rms',
-         'covered by 95 % [%]', 'intervals wider by', 'largest move [std]'], rows, figures)
+         'covered by 95 % [%]', 'intervals wider by', 'largest change [std]'], rows, figures,
+        legend=[
+            '*Bias*: mean error of the worst parameter, in reported standard deviations; '
+            f'{1.0 / np.sqrt(runs):.2f} by chance.',
+            '*Error*: root mean square over all parameters, in reported standard deviations.',
+            '*Wider by* and *largest change*: width of the intervals, and largest change of a '
+            'value, relative to the same runs with white noise alone.'])
 
 
 _REPEATS = 6
@@ -229,7 +237,7 @@ def speed(*, quick: bool = False) -> Sheet:
               'viscoelastic_time': 2.0 * BLOCK.time_unit}
     levels = levels_of(False, 15)
     times = np.arange(2000) * 1e-3
-    rows, figures, shooting = [], {}, ''
+    rows, figures, shooting = [], {}, []
     for free, known in ((DEFAULT_FREE, {}), (nine, others)):
         blank = Measurement(times, np.linspace(1.0, 1.5, len(times)), *levels)
         values = values_of(BLOCK, known)
@@ -255,8 +263,8 @@ def speed(*, quick: bool = False) -> Sheet:
             if run is None:
                 continue
             if name.startswith('CasADi'):
-                shooting = (', and multiple shooting (Runge-Kutta, Gauss-Newton) whose set-up is '
-                            'not counted')
+                shooting = ['*CasADi*: multiple shooting (Runge-Kutta, Gauss-Newton), without its '
+                            'set-up.']
             found = [run() for _ in range(2 if quick else _REPEATS)][1:]
             apart = max(
                 abs(found[0].values[x] - reference[x].value) / reference[x].std for x in free)
@@ -266,7 +274,8 @@ def speed(*, quick: bool = False) -> Sheet:
             figures[rows[-1][0]] = {'seconds': spent, 'apart': apart}
     return Sheet(
         'identification_speed',
-        'Time for 2 s at 1 kHz: this package with start values, diagnosis and intervals; SciPy '
-        'for the fit alone, from values with errors of 10 %, on the same simulation'
-        f'{shooting}; difference of the results in standard deviations',
-        ['', 'least [ms]', 'median [ms]', 'apart [std]'], rows, figures)
+        'Time to identify 2 s at 1 kHz',
+        ['', 'least [ms]', 'median [ms]', 'apart [std]'], rows, figures, legend=[
+            '*This package*: start values, fit, diagnosis and intervals.',
+            '*SciPy*: the fit alone, of the same simulation, from values with errors of 10 %.',
+            *shooting, '*Apart*: difference of the results in standard deviations.'])

@@ -18,6 +18,7 @@ class Sheet:
     rows: Sequence[Sequence[str]]
     figures: Mapping[str, Any] = field(default_factory=dict)  # the same in full, for JSON
     passed: bool = True  # whether the goals are met
+    legend: Sequence[str] = ()  # what the columns mean, one each
 
     def show(self, console: Console) -> None:
         """Print the table."""
@@ -27,12 +28,16 @@ class Sheet:
         for cells in self.rows:
             table.add_row(*cells)
         console.print(table)
+        for text in self.legend:
+            console.print(f'* {text}', markup=False, highlight=False)
 
     def markdown(self) -> str:
         """Return the table for a page of the documentation."""
         rule = ['---', *['--:'] * (len(self.head) - 1)]
         lines = ['| ' + ' | '.join(cells) + ' |' for cells in (self.head, rule, *self.rows)]
-        return '\n'.join([f'**{self.title}**', '', *lines, ''])
+        legend = [f'* {x}' for x in self.legend]
+        return '\n'.join([
+            f'**{self.title}**', '', *legend, *[''] * bool(legend), *lines, ''])
 
     def record(self) -> dict[str, Any]:
         """Return the table for a JSON file."""

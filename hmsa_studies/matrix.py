@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from hmsa_studies.feedback import CYCLE, CYCLES, ExpectedResidual, trial
-from hmsa_studies.scenario import CHAINED, Scenario, SCENARIOS, STRATEGIES, Strategy, TARGETS
+from hmsa_studies.scenario import ROBUST, Scenario, SCENARIOS, STRATEGIES, Strategy, TARGETS
 from hmsa_studies.study_folder import RowStudy
 
 #: Errors of the shear modulus that are combined into one row.
@@ -105,7 +105,7 @@ def allowed(scenario: Scenario, error: float) -> list[float]:
     # A fifth more than that of the chain of order 2 or, without model errors, half of the
     # peak-to-peak noise in the samples of a cycle.
     if error or scenario.truth or scenario.coil_time_constant:
-        return [_WORSE * x.vibration for x in trial(scenario, CHAINED, error, 0)]
+        return [_WORSE * x.vibration for x in trial(scenario, ROBUST, error, 0)]
     count = CYCLE * scenario.block.time_unit / scenario.period
     steps = [float(x) for x in np.diff([0.0, *TARGETS])]
     shown = scenario.noise * _range(count)

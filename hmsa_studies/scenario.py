@@ -84,8 +84,8 @@ class Strategy:
     kind: str = 'open'
 
 
-CHAINED = Strategy('chained', 'robust', 2)
+ROBUST = Strategy('robust', 'robust', 2)
 STRATEGIES = (
-    Strategy('two-step', 'two_step'), CHAINED, Strategy('ZVD', 'zvd'),
+    Strategy('two-step', 'two_step'), ROBUST, Strategy('ZVD', 'zvd'),
     Strategy('learning', 'two_step', kind='learning'), Strategy('LQR', 'two_step', kind='lqr'),
     Strategy('MPC', 'two_step', kind='mpc'), Strategy('adapt', 'two_step', kind='adapt'))

@@ -351,9 +351,9 @@ def test_robustness_with_feedback_compares_open_loop_with_corrections(run, monke
     status, out, err = run('robustness', '--feedback', '--seeds', 1, '--json')
     assert (status, err) == (0, '')
     rows = json.loads(out)['rows']
-    assert [x['strategy'] for x in rows] == ['chained', 'adapt']
-    chained, adapted = ([y['vibration'] + abs(y['offset']) for y in x['left']] for x in rows)
-    assert min(chained) > 0.05
+    assert [x['strategy'] for x in rows] == ['robust', 'adapt']
+    cascaded, adapted = ([y['vibration'] + abs(y['offset']) for y in x['left']] for x in rows)
+    assert min(cascaded) > 0.05
     assert max(adapted) < 0.002
     words = 'robustness', '--feedback', '--seeds', 2
     status, out, err = run(*words)

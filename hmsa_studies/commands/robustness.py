@@ -292,6 +292,18 @@ def _feedback(arguments: argparse.Namespace, start: 'Start', in_chunks: bool) ->
             as_json=arguments.json, table=table))
 
 
+_LEGEND = """\
+Peak-to-peak vibration (steady-state error) in % of the step, root mean square.
+* columns: after the first move (0.4 from rest), one and two cycles later, and after the next move
+  (to 0.1); the error that remains if nothing is corrected from then on
+* robust: order 2
+* learning: the four columns are four trials of the first move
+* LQR, MPC: measured in the cycle that follows, with the loop closed
+* worst: largest vibration after the first move
+* no worse: no vibration exceeds 1.2 times that of robust or, if the model is exact, half of that
+  which noise alone shows"""
+
+
 def _show_matrix(
         seeds: int, rows: 'Iterator[Row]', *, as_json: bool, table: Path | None = None) -> int:
     """Print rows as they are computed."""
@@ -299,13 +311,7 @@ def _show_matrix(
         found = {'seeds': seeds, 'rows': [asdict(x) for x in rows]}
         print(json_text(found if table is None else {**found, 'files': [table]}))
         return 0
-    print('peak-to-peak vibration (offset) in % of the step, root mean square: after the first '
-          'move\n(0.4 from rest), a cycle and two cycles later, after the next move (to 0.1); what'
-          ' would be left\nif nothing was corrected from then on. LQR and MPC: as seen in the '
-          'cycle that follows, the\nloop closed. Learning: after each of four trials of the first '
-          'move. Worst: vibration after\nthe first move. No worse: no vibration above 1.2 times '
-          'that of the chain, or, where the model\nis exact, above half of what noise alone '
-          'shows.')
+    print(_LEGEND)
     before = ''
     for row in rows:
         if row.scenario != before:
