@@ -11,19 +11,27 @@ from sphinx import addnodes
 from sphinx.application import Sphinx
 
 WORDS = {
+    'explanation/beam': ('beam', 'cantilever', 'strip'),
+    'explanation/creep': ('viscoelastic', 'relaxation'),
     'explanation/faults': ('emergency stop', 'interlock', 'watchdog'),
     'explanation/modes': ('mode shapes',),
+    'explanation/which-shaper': ('choose a shaper', 'input shaping', 'ZV'),
     'guides/calibration': ('field to current', 'current', 'ampere', 'coil constant'),
     'guides/hyperelastic-models': ('Gent', 'Ogden', 'Yeoh', 'stress-strain curve'),
-    'guides/recording': ('Matlab', 'CSV', 'rosbag', 'export'),
+    'guides/recording': ('Matlab', 'CSV', 'rosbag', 'export', 'replay'),
     'guides/report': ('figure', 'plot', 'paper figure'),
-    'guides/sensors': ('camera', 'laser'),
+    'guides/sensors': ('camera', 'laser', 'millimetres', 'motion capture'),
     'guides/serial-board': ('Arduino', 'microcontroller'),
     'guides/several-actuators': ('several actuators', 'two actuators', 'joints'),
-    'guides/setpoints': ('stop', 'joystick', 'MoveIt', 'trajectory'),
+    'guides/setpoints': ('stop', 'joystick', 'MoveIt', 'trajectory', 'publish a sequence'),
+    'guides/sweeps': ('sweep', 'parameter study'),
+    'guides/viewers': ('RViz', 'Foxglove', 'PlotJuggler'),
     'guides/without-ros': ('gait', 'sine wave', 'periodic motion'),
     'reference/driver': ('bench supply',),
-    'tutorials/notebook': ('Python', 'notebook', 'pandas'),
+    'tutorials/first-run': ('demo', 'install'),
+    'tutorials/identify': ('system identification', 'fit parameters'),
+    'tutorials/notebook': ('Python', 'notebook', 'pandas', 'xarray'),
+    'tutorials/your-own-driver': ('own driver', 'amplifier'),
 }
 
 
