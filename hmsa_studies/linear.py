@@ -96,7 +96,7 @@ def _motion(
             np.array([time / NANOSECONDS]))
         if motion is None:
             raise HmsaError(
-                f'the motion about {block.coordinate.name} {target:g} cannot be followed: '
+                f'the motion about {block.coordinate.name} {target:g} cannot be simulated: '
                 'expected a target away from the limits of the law')
         ends.append((motion, scale * [motion.stretch[0], motion.rate[0]]))
     (one, low), (other, high) = ends

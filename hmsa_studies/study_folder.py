@@ -284,9 +284,9 @@ class StudyFolder:
                 found = None
             if found != self.digest:
                 raise BadInputError(
-                    f'{self.folder} holds another study, or the same of another version of this '
-                    'package: expected an empty folder or that of this study; name another with '
-                    '--out, or remove it')
+                    f'{self.folder} contains another study, or the same of another version of '
+                    'this package: expected an empty folder or that of this study; name another '
+                    'with --out, or remove it')
         elif any((self.folder / x).exists() for x in ('chunks', 'table.parquet')):
             raise BadInputError(
                 f'{self.folder} has chunks or a table but no study.json: expected an empty '

@@ -280,7 +280,7 @@ def test_what_is_not_there_is_said(tmp_path, capsys):
     (tmp_path / 'empty').mkdir()
     for name, expected in (
             ('none', 'does not exist'), ('/proc/self/mem', 'cannot be read (Input/output error)'),
-            ('empty', 'holds no .mcap or .db3 file')):
+            ('empty', 'contains no .mcap or .db3 file')):
         assert main(['bag', 'info', str(tmp_path / name)]) == 2
         assert expected in capsys.readouterr().err
 
@@ -383,7 +383,7 @@ def test_two_bags_under_one_name_are_told_apart(tmp_path):
     shutil.copy(other, tmp_path / 'bag')
     reader, got = stamps(tmp_path / 'bag')
     assert len(got) == 400
-    assert any('also holds other_0.mcap' in problem for problem in reader.problems)
+    assert any('also contains other_0.mcap' in problem for problem in reader.problems)
     (tmp_path / 'bag' / 'metadata.yaml').unlink()
     with pytest.raises(BadInputError, match=r'several bags \(bag, other\)'):
         BagReader(tmp_path / 'bag')

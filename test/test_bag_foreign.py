@@ -138,7 +138,7 @@ def test_links_in_a_compressed_bag_are_not_followed(tmp_path):
     path = folder / 'bag.db3.zstd'
     path.rename(tmp_path / 'elsewhere')
     path.symlink_to(tmp_path / 'elsewhere')
-    with pytest.raises(BadInputError, match='holds the link bag.db3.zstd'):
+    with pytest.raises(BadInputError, match='contains the link bag.db3.zstd'):
         BagReader(folder)
 
 

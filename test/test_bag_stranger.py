@@ -101,9 +101,11 @@ def hostile_files():
     nested = b'A[] a\n' + b'=' * 80 + b'\nMSG: x/A\n'
     many = struct.pack('<I', 10 * MEGA) + bytes(10 * MEGA)
     yield 'zstd bomb', chunk(zeros, 512 * MEGA), 'larger than the 4194304 bytes allowed'
-    yield 'zstd bomb that lies', chunk(zeros, MEGA), 'does not decompress to the size it says'
+    yield 'zstd bomb that lies', chunk(
+        zeros, MEGA), 'does not decompress to the size in its header'
     yield 'lz4 bomb that lies', chunk(
-        lz4.frame.compress(bytes(512 * MEGA)), MEGA, 'lz4'), 'bytes of content: it says 1048576'
+        lz4.frame.compress(bytes(512 * MEGA)), MEGA, 'lz4'), (
+            'bytes of content: its header states 1048576')
     yield 'declared size beyond all memory', chunk(zeros, 2**62), 'bytes allowed'
     yield 'zstd frame of unknown size', chunk(
         zstandard.ZstdCompressor(write_content_size=False).compress(bytes(64 * MEGA)),
@@ -230,7 +232,8 @@ def test_files_outside_the_folder_are_not_read(tmp_path):
         assert reader.files == (bag / 'bag_0.mcap',)
     (bag / 'bag_0.mcap').unlink()
     (bag / 'bag_0.mcap').symlink_to(other / 'other_0.mcap')
-    with pytest.raises(BadInputError, match='holds no .mcap or .db3 file: .*; name .*/bag_0.mcap'):
+    with pytest.raises(
+            BadInputError, match='contains no .mcap or .db3 file: .*; name .*/bag_0.mcap'):
         BagReader(bag)
     # A link that stays inside, and one that is named itself, are what they seem.
     (other / 'other_1.mcap').symlink_to('other_0.mcap')

@@ -304,7 +304,7 @@ def test_parameter_file_keeps_mount_and_modes(tmp_path):
     block = Actuator(half_length=5e-3, zeta=0.1, mount='free')
     block.to_yaml(tmp_path / 'block.yaml')
     assert Actuator.from_yaml(tmp_path / 'block.yaml') == block
-    with pytest.raises(BadInputError, match='has modes already'):
+    with pytest.raises(BadInputError, match='already has modes'):
         block.replace(mount='glued')
 
 

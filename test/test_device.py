@@ -92,7 +92,7 @@ def test_a_command_for_at_once_is_not_late_and_a_late_one_is_told():
     assert told(device) == [(0.0, 0.05), (5.0, 0.02)]
     (notice,) = device.notices()
     assert (notice.kind, notice.joint, notice.late) == (Kind.LATE, 0, 3 * MS)
-    assert '3.000 ms after the time it applies' in notice.text
+    assert '3.000 ms after its timestamp' in notice.text
 
 
 @pytest.mark.parametrize('value', [math.nan, math.inf, 1e300])

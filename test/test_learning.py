@@ -195,7 +195,7 @@ def test_levels_that_follow_creep_are_kept_and_corrected_with_their_move():
 @pytest.mark.parametrize(('change', 'what'), [
     (lambda x, t: ([], t), '0 repeats'), (lambda x, t: ([x], []), '0 setpoints'),
     (lambda x, t: ([x], [TargetWindow(1.15, 0.0, 1.2), TargetWindow(1.15, 1.2, 2.4)]),
-     'repeats the one'),
+     'equals the previous one'),
     (lambda x, t: ([x], [TargetWindow(1.15, 0.0, 0.1)]), 'at least a period'),
     (lambda x, t: ([x], [TargetWindow(1.15, 9.0, 12.0)]), 'no level belongs'),
     (lambda x, t: ([replace(x, time=x.time[:100], stretch=x.stretch[:100])], t), 'samples show')])

@@ -224,9 +224,9 @@ def test_where_there_is_no_chain_it_answers_what_the_chain_does():
 @pytest.mark.parametrize(
     'errors', [(0.1, 0.1), (0.1, 0.1, 1.0), (math.nan, 0.1, 0.1), (-0.1, 0.0, 0.0)])
 def test_errors_that_no_command_can_be_planned_for_are_refused(errors):
-    with pytest.raises(BadInputError, match='expected three shares of 0 to 0.9'):
+    with pytest.raises(BadInputError, match='expected three fractions of 0 to 0.9'):
         get_shaper('minimax')(MoveRequest(State(1.0), 1.1, PAPER, errors=errors))
-    with pytest.raises(BadInputError, match='expected three shares of 0 to 0.9'):
+    with pytest.raises(BadInputError, match='expected three fractions of 0 to 0.9'):
         JointModel(paper_actuator(), Options(errors=errors))
 
 
@@ -248,6 +248,6 @@ def test_hmsa_plan_takes_errors_from_the_command_line_or_from_an_identification(
             'identification.covariance': [1e4, 0.0999, 0.0999, 1e-6]}
     assert levels(**both) not in (levels(), levels(**known))
     for text, message in (
-            ('0.1', 'three shares'), ('a,b,c', "'a,b,c'"), ('2,0,0', '[2.0, 0.0, 0.0]')):
+            ('0.1', 'three fractions'), ('a,b,c', "'a,b,c'"), ('2,0,0', '[2.0, 0.0, 0.0]')):
         assert main(['plan', '1.2:9', '--errors', text]) == 2
         assert message in capsys.readouterr().err

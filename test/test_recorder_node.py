@@ -158,7 +158,7 @@ def test_what_was_sent_before_it_was_matched_is_counted_apart(record, ros):
     assert values(reader) == [20.0, 21.0, 22.0, 23.0, 24.0]
     assert missing_messages(reader.custom_data, 'lost') == {'/a': 0}
     assert '0 lost, 20 sent before the recorder was matched' in recorder.process.stdout
-    assert 'nothing was received of /b' in recorder.process.stdout
+    assert 'no message was received on /b' in recorder.process.stdout
     summary = summarize(recorder.folder)
     assert (summary.sent_before, summary.topics[0].sent_before) == (20, 20)
     assert 'complete  yes, except 20 messages' in to_text(summary)
@@ -171,8 +171,8 @@ def test_a_topic_of_which_nothing_came_is_named_by_the_recorder_and_by_its_bag(r
     recorder.wait_for('received', '1')
     reader = recorder.end()
     assert reader.counts() == {'/a1': 1, '/a2': 0}
-    assert 'nothing was received of /a2' in recorder.process.stdout
-    assert 'note: nothing was received of /a2' in to_text(summarize(recorder.folder))
+    assert 'no message was received on /a2' in recorder.process.stdout
+    assert 'note: no message was received on /a2' in to_text(summarize(recorder.folder))
 
 
 @pytest.mark.slow

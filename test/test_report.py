@@ -898,7 +898,7 @@ def test_a_run_without_commands_shows_the_response_alone(tmp_path):
             (START, '/flux_density_command', TYPES[COMMAND], command(START, 1.0, 5.0))])
     report = Page(page([part]))
     assert part.evaluation.results == ()
-    assert 'holds no command' in ' '.join(report.words)
+    assert 'contains no command' in ' '.join(report.words)
     assert 'arrivals' not in report.ids
     assert len(report.curve('response', 'recorded')['y']) > 100
     # No scale without a field, no entry without a curve.

@@ -294,7 +294,7 @@ def test_a_driver_goes_on_after_a_pulled_cable_when_it_is_asked_to(start, ros, l
     ask(1.2, 'interlock')
     assert math.isnan(level())
     line.plug()
-    driver.wait_for_output('the hardware obeys again: a new request is obeyed')
+    driver.wait_for_output('the hardware responds again: the next request moves the actuator')
     ros.spin_until(lambda: level() == 0.0, 'the coil off')
     count = len(applied)
     ask(1.2, 'accepted', 'unchanged')

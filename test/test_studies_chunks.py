@@ -278,7 +278,7 @@ def test_the_folder_of_another_study_is_refused_and_kept(run, tmp_path):
     before = chunk_files(tmp_path / 'a')
     status, _, err = run('--c1=3', '--workers=1', '--resume', '--out=a')
     assert (status, err.count('\n')) == (2, 1)
-    assert 'a holds another study' in err
+    assert 'a contains another study' in err
     assert chunk_files(tmp_path / 'a') == before
     (tmp_path / 'a' / 'study.json').unlink()
     assert 'no study.json' in run('--workers=1', '--out=a')[2]

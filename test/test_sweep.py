@@ -217,7 +217,7 @@ def test_a_law_of_many_constants_takes_no_room_for_each_row(monkeypatch):
     (['--zeta', 'sobol:1:1'], 'LOW below HIGH'),
     (['--zeta', 'normal:1'], 'sobol:LOW:HIGH'),
     (['--zeta', 'normal:1:nan'], 'STD above 0'),
-    (['--samples', '4'], 'without anything to draw'),
+    (['--samples', '4'], 'without a random column'),
     (['--zeta', 'sobol:0:1', '--samples', '0'], '0 samples'),
     (['--zeta', 'sobol:0:1', '--seed', '-1'], 'seed of the samples is -1'),
     (['--identified'], '--identified without --params-file'),

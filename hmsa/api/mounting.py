@@ -42,8 +42,8 @@ def with_mount(model: JointModel, mount: Any, ratio: float | None) -> JointModel
             f'mount {mount} is given for a {form}: expected {", ".join([_PAPER, *others])}')
     if actuator.modes or any(x != 1.0 for x in actuator.factors.values()):
         raise BadInputError(
-            f'mount {mount} is given for an actuator that has modes already: expected one made '
-            'with mount')
+            f'mount {mount} is given for an actuator that already has modes: expected mount '
+            'alone, which computes them')
     return JointModel((_clamped if mount == _CLAMPED else _held)(actuator, mount, ratio), (
         model.options))
 

@@ -49,7 +49,7 @@ def find(path: Path, problem: _Problem) -> tuple[list[Path], metadata.BagMetadat
         if stored is not None and stored.compression_mode.upper() not in ('', 'NONE'):
             # As a whole by rosbags, which follows links.
             if links := [x for x in entries if x.is_symlink()]:
-                raise BadInputError(f'{path} is compressed and holds the link {links[0].name}: '
+                raise BadInputError(f'{path} is compressed and contains the link {links[0].name}: '
                                     'expected files')
             return [path], stored
         listed = [] if stored is None else _listed(path, stored, problem)
@@ -66,7 +66,7 @@ def find(path: Path, problem: _Problem) -> tuple[list[Path], metadata.BagMetadat
                 problem(f'{metadata.FILE_NAME} does not name {entry.name}, which belongs to the '
                         'bag: read anyway')
             else:
-                problem(f'{path} also holds {entry.name}, which {metadata.FILE_NAME} does not '
+                problem(f'{path} also contains {entry.name}, which {metadata.FILE_NAME} does not '
                         'name: skipped')
         return listed, stored
     if not present:
@@ -76,13 +76,13 @@ def find(path: Path, problem: _Problem) -> tuple[list[Path], metadata.BagMetadat
         inside = sorted({x.parent for suffix in _SUFFIXES for x in path.glob(f'*/*{suffix}')}
                         | set(path.glob('*.bag')))
         links = [x for x in entries if x.suffix in _SUFFIXES and x.is_file()]
-        raise BadInputError(f'{path} holds no .mcap or .db3 file: expected a bag' + (
+        raise BadInputError(f'{path} contains no .mcap or .db3 file: expected a bag' + (
             f', such as {inside[0]}' if inside else
             f'; name {links[0]}, a link out of the folder, to read it' if links else ''))
     stems = dict.fromkeys(_order(x)[0] for x in present)
     if len(stems) > 1:
         raise BadInputError(
-            f'{path} has no usable {metadata.FILE_NAME} and holds files of several bags '
+            f'{path} has no usable {metadata.FILE_NAME} and contains files of several bags '
             f'({", ".join(stems)}): expected one bag; name one of its files')
     return present, stored
 

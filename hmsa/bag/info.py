@@ -202,7 +202,7 @@ def _lines(
             yield (f'note: {_messages(topic.sent_before)} of {topic.name} sent before the '
                    'recorder was matched')
     if silent := [x.name for x in summary.topics if not x.count]:
-        yield f'note: nothing was received of {", ".join(silent)}'
+        yield f'note: no message was received on {", ".join(silent)}'
     yield from (f'note: {x}' for x in (*summary.problems, *notes))
 
 

@@ -79,7 +79,8 @@ class MessageBlock:
         except (struct.error, UnicodeDecodeError) as error:
             raise BagError('a chunk record ends early') from error
         if begin + stored != length:
-            raise BagError(f'a chunk record has {length} bytes: it says {begin + stored}')
+            raise BagError(
+                f'a chunk record has {length} bytes: its header states {begin + stored}')
         return cls(
             file, offset + PREFIX.size + begin, stored, size, start, end, compression, crc)
 
@@ -119,7 +120,7 @@ def parse(kind: type[_Record], content: bytes) -> _Record:
     except (McapError, struct.error) as error:
         raise BagError(f'a {what} record ends early') from error
     if stream.count != len(content):
-        raise BagError(f'a {what} record is longer than what it holds')
+        raise BagError(f'a {what} record is longer than its content')
     return record
 
 
@@ -139,7 +140,7 @@ def decompress(data: bytes, compression: str, size: int) -> bytes:
             # A frame may contain its size, which must be that of the chunk: decompression never
             # allocates more.
             if zstandard.frame_content_size(data) not in (size, -1):
-                raise BagError('a chunk does not decompress to the size it says')
+                raise BagError('a chunk does not decompress to the size in its header')
             content = zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
         except zstandard.ZstdError as error:
             raise BagError(f'a chunk does not decompress: {error}') from error
@@ -152,7 +153,7 @@ def decompress(data: bytes, compression: str, size: int) -> bytes:
     else:
         raise BagError(f'a chunk is compressed with {compression!r}: expected lz4 or zstd')
     if len(content) != size:
-        raise BagError(f'a chunk has {len(content)} bytes of content: it says {size}')
+        raise BagError(f'a chunk has {len(content)} bytes of content: its header states {size}')
     return content
 
 

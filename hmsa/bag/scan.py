@@ -281,7 +281,7 @@ class ScannedFile:
         found, said = self._counts.total(), self.said
         if said is not None and said != found:
             self.problem(f': {said - found} of {said} messages cannot be read' if said > found else
-                         f' holds {found} messages that can be read: it says {said}')
+                         f' contains {found} readable messages: its summary states {said}')
 
     # -- by the summary -------------------------------------------------------------------------
 
@@ -297,7 +297,7 @@ class ScannedFile:
             if not start:
                 return False
             if not _DATA_END_SIZE < start <= end or end - start > limits.SUMMARY_SIZE:
-                raise BagError('it does not lie where the file says')
+                raise BagError('it is not at the position that the footer states')
             summary = records.read_exactly(self._descriptor, end - start, start)
             if footer.summary_crc not in (0, zlib.crc32(tail[:25], zlib.crc32(summary))):
                 raise BagError('its CRC differs')
@@ -328,7 +328,7 @@ class ScannedFile:
             return False
         if statistics.chunk_count != len(self.blocks) and not self._damaged:
             raise BagError(
-                f'it says {statistics.chunk_count} chunks and has {len(self.blocks)}')
+                f'it states {statistics.chunk_count} chunks and has {len(self.blocks)}')
         self.blocks.sort(key=lambda block: block.offset)
         self._counts = Counter(statistics.channel_message_counts)
         self.said = statistics.message_count

@@ -57,8 +57,8 @@ def add_parser(subparsers: Any) -> None:
          'parameter file to write for planner and plant, only if identified or with --accept; '
          'replaces an existing file'),
         ('--accept',
-         'also write the file of a model that is rejected for a defect that costs at most 5 %% of '
-         'a step; the exit status is 3 then'),
+         'also write the file if the model is rejected for a defect that leaves at most 5 %% of a '
+         'step; the exit status is then 3'),
         ('--report', 'HTML', Path,
          'HTML page to write: data, fit, residuals and intervals; an existing file is replaced'),
         JSON)

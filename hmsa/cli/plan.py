@@ -63,9 +63,9 @@ def add_parser(subparsers: Any) -> None:
          'two_step (default), robust, minimax, minimum_time, modal, smooth, step, zv, zvd, ei or '
          'umzv'),
         ('--order', 'N', int,
-         'number of two-step commands that robust cascades; minimax takes as long; modal takes as '
-         'many half periods of a block with modes, and each above 2 adds half a period for a beam '
-         '(default 2)',
+         'order of robust, a cascade of N two-step commands, and of minimax, which takes as long; '
+         'half periods that modal takes for a block with modes; for a beam, each above 2 adds '
+         'half a period (default 2)',
          {'default': 2}),
         ('--errors', 'G,C,J', str,
          'relative errors in shear modulus, damping and J_lim that minimax must tolerate (default '

@@ -79,6 +79,6 @@ SEQUENCE: tuple[Row, ...] = (
      'or YAML of hmsa learn. The levels are sent unchanged if they respect the limits of coil and '
      'block; levels that do not end at rest are followed by a shaped move to rest'),
     ('--path', 'CSV', Path,
-     'instead of setpoints: CSV with the columns time and stretch, as hmsa wave --path writes it, '
-     'followed from rest to rest by a planner whose trajectory_mode is path; with feedback: adapt '
-     'it is corrected on the way'))
+     'instead of setpoints: CSV with the columns time and stretch, as hmsa wave --path writes it. '
+     'The planner, whose trajectory_mode must be path, follows it from rest to rest. With '
+     'feedback: adapt, the planner corrects the path in progress'))

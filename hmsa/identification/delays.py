@@ -113,8 +113,8 @@ def field_delays(
     noise = math.sqrt(2.0 * found.cost / freedom)
     if float(np.max(np.abs(weight))) < _SEEN * noise:
         raise BadInputError(
-            f'the readings of the probe miss a lagged field by {noise:.3g} T, and it steps by '
-            f'{np.max(np.abs(weight)):.3g} T at most: expected a field that follows the levels; '
+            f'the readings of the probe differ by {noise:.3g} T from a lagged field with steps of '
+            f'at most {np.max(np.abs(weight)):.3g} T: expected a field that follows the levels; '
             'check the probe, or raise --limit')
     half = float(stdtrit(freedom, 0.975)) * noise * np.sqrt(
         np.abs(np.diag(np.linalg.pinv(found.jac.T @ found.jac))))
@@ -155,8 +155,8 @@ def _folded(time: Array, field: Array, begins: Array) -> tuple[Array, Array, Arr
         np.isfinite(height[place])) & (height[place] != 0.0)
     if np.count_nonzero(used) < _READINGS:
         raise BadInputError(
-            f'{np.count_nonzero(used)} readings of the probe follow a level soon: expected at '
-            f'least {_READINGS}; a probe that is read more often, or more levels')
+            f'{np.count_nonzero(used)} readings of the probe are close enough after a level: '
+            f'expected at least {_READINGS}; read the probe more often, or set more levels')
     place = place[used]
     return since[used], (field[used] - rest[place - 1]) / height[place], height[place]
 

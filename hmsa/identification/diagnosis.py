@@ -256,8 +256,8 @@ def check_plausible(fit: Fit, unknown: Collection[str]) -> None:
             hint = '; if flux densities are in mT, write "flux_density [mT]" in the header'
         unit = quantities.QUANTITIES[name].unit
         raise BadInputError(
-            f'{recording.label} moves as with a {label} of {value:.3g} {unit}, in samples '
-            f'{recording.gap:.3g} s apart: expected {least:g} to '
+            f'the motion in {recording.label} corresponds to a {label} of {value:.3g} {unit}, '
+            f'with samples {recording.gap:.3g} s apart: expected {least:g} to '
             f'{most:g} {unit}; check that times are in s, flux densities in T, and the size of '
             f'the actuator in --params-file{hint}')
 

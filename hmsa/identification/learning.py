@@ -170,7 +170,7 @@ class _Sequence:
         starts = [actuator.rest, *(x.stretch for x in targets[:-1])]
         self.steps = [x.stretch - y for x, y in zip(targets, starts, strict=True)]
         if min(map(abs, self.steps)) < 1e-6:
-            raise BadInputError('a setpoint repeats the one before: expected steps')
+            raise BadInputError('a setpoint equals the previous one: expected different stretches')
 
     def levels(self, trial: SequenceRepeat) -> Array:
         """Return the levels of a repeat, read in the middle between times."""

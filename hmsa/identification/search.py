@@ -81,7 +81,7 @@ def search(
         tried(sorted(others, key=lambda x: _miss(recording, x)))
     if not found:
         raise BadInputError(
-            f'no start value leads to a motion that {recording.label} could be compared with: '
+            f'no start value leads to a motion that is comparable with {recording.label}: '
             'expected levels in T that the actuator of --params-file can hold, as those of hmsa '
             'excite --params-file actuator.yaml --out levels.csv')
     best, agreed = _best(found)

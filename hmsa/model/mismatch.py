@@ -74,7 +74,7 @@ class Ellipsoid:
         if not (1 <= len(self.axes) <= 4 and all(math.isfinite(x) for y in self.axes for x in y)):
             raise BadInputError(
                 f'an ellipsoid of errors has the half axes {self.axes}: expected one to four, of '
-                'finite shares')
+                'finite fractions')
 
     def offs(self, largest: float) -> list[Offs]:
         """Return the ends of the axes, the middles of the first, and points in between."""

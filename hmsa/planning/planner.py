@@ -135,8 +135,9 @@ class Planner(RunningPlan):
         begin = self.model.on_grid((soonest if stamp is None else stamp) + points[0][1])
         if begin < soonest:
             raise RefusedError(
-                Code.IN_THE_PAST, f'the first level applies {(now - begin) / NANOSECONDS:.3f} s '
-                'ago: expected levels more than lead_time ahead')
+                Code.IN_THE_PAST,
+                f'the timestamp of the first level was {(now - begin) / NANOSECONDS:.3f} s ago: '
+                'expected levels more than lead_time ahead')
         return draft_levels(self._outset(begin), points)
 
     def draft_path(

@@ -236,7 +236,7 @@ def _check_known(request: MoveRequest, levels: Sequence[Level], ends: tuple[floa
     if lost:
         raise RefusedError(
             Code.OUT_OF_RANGE,
-            f'the move from {where} to {target:g} overshoots and cannot be followed: '
+            f'the move from {where} to {target:g} overshoots beyond what the model can simulate: '
             'expected a smaller move, or a shaper that does not overshoot, such as two_step')
     for widest, beyond in ((np.min(stretch), -1.0), (np.max(stretch), 1.0)):
         limit = elastic.limits[beyond > 0.0]
@@ -246,4 +246,4 @@ def _check_known(request: MoveRequest, levels: Sequence[Level], ends: tuple[floa
                 f'the move from {where} to {target:g} '
                 f'swings to {widest:.4f}: expected a motion between the limits '
                 f'{elastic.limits[0]:.4f} and {elastic.limits[1]:.4f} of law {elastic.law}, '
-                'beyond which nothing is known')
+                'outside which it is not defined')

@@ -306,7 +306,7 @@ class _Collected:
                 'and so are setpoints that were not requested.')
         elif not self.commands[key]:
             notes.append(
-                f'{topics[roles.COMMAND]} holds no command: there is no setpoint to evaluate.')
+                f'{topics[roles.COMMAND]} contains no command: there is no setpoint to evaluate.')
         if refused:
             notes.append(
                 f'{refused} commands are not finite or not along z: left out, as the plant '

@@ -66,7 +66,7 @@ class SampleReader:
         """
         if not self._columns:
             raise BadInputError(
-                f'{where} holds no message that can be used: expected samples of the actuator')
+                f'{where} contains no usable message: expected samples of the actuator')
         joint = self._joint(where, joint, required)
         parts = []
         total = 0
@@ -83,7 +83,7 @@ class SampleReader:
             parts.append((times[:, 0], times[:, 1], *picked))
         if not parts:
             raise BadInputError(
-                f'{where} holds no position of joint {joint!r}: expected the stretch, '
+                f'{where} contains no position of joint {joint!r}: expected the stretch, '
                 'or the deflection of a beam')
         found = dict(zip(
             _COLUMNS, map(np.concatenate, zip(*parts, strict=True)), strict=True))
@@ -131,7 +131,7 @@ def _tidy(where: str, columns: Columns) -> tuple[Columns, list[str], int]:
             f'{odd} samples are not finite numbers, or beyond {_LARGEST_STRETCH:g}: left out.')
     if not np.any(good):
         raise BadInputError(
-            f'{where} holds no finite position: expected the stretch as a number')
+            f'{where} contains no finite position: expected the stretch as a number')
     columns = _rows(columns, good)
     if np.any(np.diff(columns['time']) < -CLOCK_JUMP):
         notes.append(

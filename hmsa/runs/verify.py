@@ -87,8 +87,8 @@ def verify_run(run: Run) -> Verification:
             f'files, for example {run.path / run.summary.files[0][0]}')
     if COMMAND not in run.topics and not run.levels:
         raise BadInputError(
-            f'{run.path} holds no {COMMAND} and no field: expected a run with what drove the '
-            'actuator; its topics are ' + (', '.join(run.topics.values()) or 'none'))
+            f'{run.path} contains no {COMMAND} and no field: expected a run with the commands of '
+            'the actuator; its topics are ' + (', '.join(run.topics.values()) or 'none'))
     if not run.parameters_known:
         raise BadInputError(
             f'{run.path} does not contain the parameters of the plant: name a parameter file '

@@ -53,8 +53,8 @@ def add_parser(subparsers: Any) -> None:
     add_command(
         kinds, 'coil', _coil.__doc__,
         ('source', 'MODULE:NAME|CSV', str,
-         'hardware as in the parameter hardware of hmsa driver, with a coil constant that is '
-         'roughly right; or readings with the columns current (A) and flux_density (T), in the '
+         'hardware as in the parameter hardware of hmsa driver, with an approximate coil '
+         'constant; or readings with the columns current (A) and flux_density (T), in the '
          'order taken'),
         _SET, _LIMIT,
         ('--steps', 'N', int, 'levels on each quarter of the loop (default 5)', {'default': 5}),
@@ -79,7 +79,7 @@ def add_parser(subparsers: Any) -> None:
          'class, or function without arguments, that returns a field probe: an object whose '
          'read() '
          'returns a flux density in T, or a list of (flux density, NaN, time in ns)'),
-        ('--lag', 'S', float, 'known time constant of the coil, where there is no probe'),
+        ('--lag', 'S', float, 'known time constant of the coil, if there is no probe'),
         ('--out', 'YAML', Path, 'parameter file of driver and planner to write'),
         JSON, *picture_options('response of the field to draw, or of the stretch'), run=_latency)
     add_command(
@@ -87,7 +87,7 @@ def add_parser(subparsers: Any) -> None:
         ('--steps', 'N', int, 'levels on each quarter of the staircase (default 5)',
          {'default': 5}),
         ('--settle', 'S', float,
-         'time at each level, of which the second half counts (default 2 s)', {'default': 2.0}),
+         'time at each level; samples of the second half count (default 2 s)', {'default': 2.0}),
         ('--gauge', 'MODULE:NAME', str,
          'class, or function without arguments, that returns a gauge: an object whose read() '
          'returns the '

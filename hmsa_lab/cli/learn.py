@@ -2,8 +2,8 @@
 Correct the levels of a sequence by the errors of its repeats.
 
 Read the runs of one sequence, in their order, and correct its levels by the measured errors, such
-as those by hysteresis or further modes. The first run has the planned setpoints; each of the
-others executed the levels learnt from those before it. Print the error of each run, and write the
+as those from hysteresis or further modes. The first run executed the planned setpoints, and each
+later run the levels learnt from the earlier ones. Print the error of each run, and write the
 levels for the next run, for hmsa run --levels. After two runs that are worse than an earlier one,
 these are the levels of the best run.
 

@@ -50,8 +50,8 @@ def add_parser(subparsers: Any) -> None:
          {'default': ''}),
         ('--known', 'NAME=VALUE[+-STD],...', str, 'fixed values, as in hmsa identify',
          {'default': ''}),
-        ('--accept', 'also continue with a model that is rejected for a defect that costs at '
-                     'most 5 %% of a step'),
+        ('--accept', 'also continue if the model is rejected for a defect that leaves at most '
+                     '5 %% of a step'),
         ('--out', 'YAML', Path,
          'parameter file to write (default actuator.yaml in the folder of the runs); an existing '
          'file is replaced'),

@@ -56,7 +56,7 @@ def add_parser(subparsers: Any) -> None:
          'steady-state error and residual vibration that count as arrived, as a fraction of the '
          "step (default: the planner's arrival_tolerance, vibration_tolerance and "
          'stretch_tolerance, which also apply to the end of --levels)'),
-        ('--repeat', 'N', int, 'execute it N times, and print statistics (default 1)',
+        ('--repeat', 'N', int, 'number of executions, with statistics (default 1)',
          {'default': 1}),
         ('--report', 'also write report.html'),
         ('--out', 'DIR', Path, 'folder for the output (default hmsa_run/ plus date and time)'),
@@ -165,10 +165,10 @@ def _tolerances(arguments: argparse.Namespace) -> 'Tolerances | None':
     if arguments.levels is not None or arguments.path is not None:
         given = 'levels' if arguments.path is None else 'path'
         raise BadInputError(
-            f'--tolerance is given with --{given}: expected setpoints with it; the end is '
-            "judged by the planner's arrival_tolerance and vibration_tolerance")
+            f'--tolerance is given with --{given}: expected setpoints with it; for the '
+            "end, the planner's arrival_tolerance and vibration_tolerance count")
     if not 0.0 < tolerance < math.inf:
-        raise BadInputError(f'tolerance is {tolerance:g}: expected a share above 0')
+        raise BadInputError(f'tolerance is {tolerance:g}: expected a fraction above 0')
     return Tolerances(tolerance, tolerance, 0.0)
 
 

@@ -335,8 +335,8 @@ class PlannerClient(Link):
             now = self.verdict
             if now.plan != verdict.plan:
                 raise HmsaError(
-                    'the sequence was not followed to its end: a newer request came, for its '
-                    f'joints or others ({now.message})')
+                    'the sequence ended early: a newer request arrived, for its joints or for '
+                    f'others ({now.message})')
             nonlocal heard
             ended = (
                 now.setpoint == now.setpoints and now.state in ('at_rest', 'settling')

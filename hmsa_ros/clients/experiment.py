@@ -119,8 +119,8 @@ def prepare(folder: Path) -> None:
         raise ModuleNotFoundError("No module named 'rclpy'", name='rclpy')
     if (folder / 'run').exists():
         raise BadInputError(
-            f'{folder} holds an earlier run: expected another folder (--out), or this one '
-            'removed')
+            f'{folder} contains an earlier run: name another folder with --out, or remove '
+            'this one')
     make_folder(folder)
 
 

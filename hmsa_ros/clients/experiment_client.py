@@ -170,7 +170,8 @@ class ExperimentClient(PlannerClient):
             raise HmsaError(f'time does not advance beyond {now:g} s: expected messages on /clock')
         if not self.node.count_publishers(
                 topics.from_outside(topics.STATUS.name, topics.PLANNER)):
-            raise HmsaError('the planner has gone: expected it to run until the end')
+            raise HmsaError(
+                'the planner has ended: expected it to run until the end of the sequence')
         if unheard := self.unheard():
             raise HmsaError(
                 f'no node receives the commands on {", ".join(unheard)} any more: expected plant '
@@ -179,7 +180,7 @@ class ExperimentClient(PlannerClient):
             self._over = self._over or moment
             if moment - self._over > _GRACE_SECONDS:
                 raise HmsaError(
-                    f'the sequence has not come to its end {_GRACE_SECONDS:g} s after its time')
+                    f'the sequence has not ended {_GRACE_SECONDS:g} s after its planned end')
 
     def unpause(self) -> None:
         """Resume simulated time."""

@@ -380,7 +380,7 @@ class Coil(GuardedJoint):
         why = f' ({error})' if str(error) else ''
         self.note(
             Kind.LOST, f'{self.instrument.name} has lost its state{why} and its coil is off: '
-            'what was commanded is forgotten, send a new request')
+            'all commands are discarded; send a new request')
         self.set(now, 0.0, 0.0)
         self._clear()
         self._armed = False

@@ -103,7 +103,7 @@ class GuardedJoint:
     def note_late(self, late: int) -> None:
         """Add a notice of a command that arrived some ns after its timestamp."""
         self.note(
-            Kind.LATE, f'command arrived {late / 1e6:.3f} ms after the time it applies and was '
+            Kind.LATE, f'command arrived {late / 1e6:.3f} ms after its timestamp and was '
             'applied at once: raise lead_time of the planner', late)
 
     def pass_over(self, span: int) -> None:
@@ -268,9 +268,10 @@ class GuardedJoint:
             self._stray = f'the newest one came {late / NANOSECONDS:.3f} s late'
             self.too_late = stamp
             self.note(
-                Kind.REFUSED, f'{level:g} T came {late / NANOSECONDS:.3f} s after the time it '
-                f'applies: expected at most {self._fallback.lateness_limit:g} s (lateness_limit); '
-                'the planner sends the rest anew; raise its lead_time, or compare the clocks')
+                Kind.REFUSED,
+                f'{level:g} T arrived {late / NANOSECONDS:.3f} s after its timestamp: expected '
+                f'at most {self._fallback.lateness_limit:g} s (lateness_limit); the '
+                'planner plans the rest again; raise its lead_time, or compare the clocks')
             return True
         self._obeyed = True
         return False

@@ -209,7 +209,7 @@ class HardwareWorker:
     def _come_back(self) -> None:
         """Prepare to continue: all coils are off and locked for a while."""
         self.trouble, self._away = (
-            f'{self._away}: the coil is switched off, and what was commanded is forgotten', '')
+            f'{self._away}: the coil is switched off, and all commands are discarded', '')
         self.device.lock(self.trouble, self._now())
         self._resumes = monotonic() + _AWAY
 

@@ -196,7 +196,8 @@ class DriverNode(DeviceNode):
             if why:
                 self.get_logger().error(f'interlock open, the coil goes off: {why}')
             else:
-                self.get_logger().info('interlock closed: a new request is obeyed')
+                self.get_logger().info(
+                    'interlock closed: the next request moves the actuator again')
             if self._joints:
                 self._diagnose()
 
@@ -208,7 +209,8 @@ class DriverNode(DeviceNode):
             if trouble:
                 self.get_logger().error(trouble)
             else:
-                self.get_logger().info('the hardware obeys again: a new request is obeyed')
+                self.get_logger().info(
+                    'the hardware responds again: the next request moves the actuator')
             if self.values[RECONNECT.name]:
                 self.away = trouble
             else:

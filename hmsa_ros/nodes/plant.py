@@ -108,8 +108,8 @@ def _from_wrench(message: WrenchStamped) -> tuple[int, float]:
         raise BadInputError(f'force.z is {force.z:g} N: expected a finite number')
     if any((force.x, force.y, torque.x, torque.y, torque.z)):
         raise BadInputError(
-            'a force across the field or a torque: expected force.z alone, the block moves '
-            'along the field only')
+            'there is a force across the field, or a torque: expected force.z alone, since the '
+            'block moves along the field only')
     stamp = conversions.from_time(message.header.stamp)
     if stamp < 0:
         raise BadInputError(f'disturbing force has timestamp {stamp} ns: expected at least 0')

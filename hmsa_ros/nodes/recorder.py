@@ -365,7 +365,7 @@ class Recorder(ManagedNode):
                 if count:
                     print('hmsa recorder:', sentence.format(count, name), flush=True)
         if silent := self._recorded.silent():
-            print(f'hmsa recorder: nothing was received of {", ".join(silent)}', flush=True)
+            print(f'hmsa recorder: no message was received on {", ".join(silent)}', flush=True)
         # Gaps in what was received are counted; what was received must be in the bag.
         unwritten = sum(lost_by_topic(status.overflowed, status.dropped).values())
         if self.failure is None and (status.error or unwritten):

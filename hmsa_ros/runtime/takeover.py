@@ -282,9 +282,9 @@ class Takeover:
         silence = (steady - seen.came) / NANOSECONDS
         raise RefusedError(
             Code.UNSEEN,
-            f'no sample of joint {name} for {silence:.1f} s, though there were '
-            'some and joint_states has a publisher: expected one before the actuator is moved; '
-            'repair the sensor, or end its publisher')
+            f'no sample of joint {name} for {silence:.1f} s, although joint_states has a '
+            'publisher: expected a sample before the actuator is moved; repair the sensor, or '
+            'end its publisher')
 
     def _settle(self, keep: str = '') -> None:
         """Stop waiting, and keep doubting only a joint of which nothing is known."""

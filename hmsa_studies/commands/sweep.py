@@ -37,7 +37,7 @@ _SMALL = 3.4
 _LARGE = 1_000_000
 # Options of columns, with descriptions.
 _AXES = (
-    ('--start', 'initial stretch, at rest (default 1; of a beam 0)'),
+    ('--start', 'initial stretch, at rest (default 1; for a beam 0)'),
     ('--target', 'target stretch (default 1.1)'),
     *((option, text) for option, _, text in MATERIAL),
 )
@@ -204,7 +204,7 @@ def _sweep(arguments: argparse.Namespace) -> 'Sweep':
             arguments.seed)
     elif arguments.samples is not None:
         raise BadInputError(
-            '--samples without anything to draw: expected a column sobol:LOW:HIGH or '
+            '--samples is given without a random column: expected sobol:LOW:HIGH or '
             'normal:MEAN:STD, or --identified')
     return Sweep(
         {name: x for name, x in values.items() if not isinstance(x, Spread)},

@@ -57,7 +57,7 @@ def as_errors(values: Sequence[float] | Ellipsoid) -> Uncertainty:
     if not all(0.0 <= x <= LARGEST_ERROR for x in (modulus, damping, limit)):
         raise BadInputError(
             f'errors of G, damping coefficient and J_lim are {excerpt(values)}: expected three '
-            f'shares of 0 to {LARGEST_ERROR:g}')
+            f'fractions of 0 to {LARGEST_ERROR:g}')
     return modulus, damping, limit
 
 
