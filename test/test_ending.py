@@ -86,6 +86,22 @@ print('armed', flush=True)
 sys.stdin.readline()
 deadline.set(0.0)
 """
+# A node whose callbacks take longer than the time between them.
+BUSY = """
+import sys
+from time import sleep
+from rclpy.node import Node
+from hmsa_ros.nodes.runner import run
+class Busy(Node):
+    def __init__(self):
+        super().__init__('busy')
+        for _ in range(2):
+            self.create_timer(0.001, self.work)
+    def work(self):
+        print('busy', flush=True)
+        sleep(0.005)
+sys.exit(run(Busy, []))
+"""
 
 
 @pytest.mark.parametrize(('arguments', 'status'), [
@@ -131,6 +147,16 @@ def test_a_node_that_is_told_to_end_while_it_is_imported_ends_without_a_word(
     expected = (1, 'hmsa: error: the recorder was told to end before its bag was open: no bag is '
                    'written\n') if node == 'recorder' else (0, '')
     assert (done.returncode, done.stderr, done.stdout) == (*expected, '')
+
+
+def test_a_node_that_is_always_busy_ends_on_a_signal(ros_env):
+    with subprocess.Popen(
+            [sys.executable, '-c', BUSY], stdout=subprocess.PIPE, env=ros_env) as node:
+        for _ in range(100):
+            assert node.stdout.readline() == b'busy\n'
+        node.send_signal(signal.SIGTERM)
+        node.stdout.read()
+        assert node.wait(60) == 0
 
 
 @pytest.mark.parametrize('node', [

@@ -12,6 +12,8 @@ import re
 import sys
 
 import rclpy
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException
 from rclpy.experimental.events_executor import EventsExecutor
@@ -25,8 +27,9 @@ from hmsa_ros.nodes.parameters import unread_files
 from hmsa_ros.nodes.temporary_node import start_ros
 
 # On this rclpy (7.1), EventsExecutor.spin() without a time limit busy-loops and delivers nothing.
-# Waiting in slices for a future that never completes works as documented.
-_SLICE_SECONDS = 0.1
+# Waiting in slices for a future works as documented. With events always at hand, though, a slice
+# does not end in time: only a timer has its turn then.
+_SLICE_SECONDS, _LOOK_SECONDS = 1.0, 0.1
 
 
 def spin(nodes: Sequence[Node], ending: Callable[[], bool]) -> None:
@@ -35,13 +38,20 @@ def spin(nodes: Sequence[Node], ending: Callable[[], bool]) -> None:
     executor = EventsExecutor(context=context)
     for node in nodes:
         executor.add_node(node)
-    never = Future()
+    ended = Future()
+
+    def look() -> None:
+        if ending() and not ended.done():
+            ended.set_result(None)
+    timer = nodes[0].create_timer(
+        _LOOK_SECONDS, look, clock=Clock(clock_type=ClockType.STEADY_TIME))
     try:
-        while context.ok() and not ending():
-            executor.spin_until_future_complete(never, _SLICE_SECONDS)
+        while context.ok() and not ended.done():
+            executor.spin_until_future_complete(ended, _SLICE_SECONDS)
     except ExternalShutdownException:
         pass
     finally:
+        timer.cancel()
         executor.shutdown()
 
 
