@@ -616,3 +616,23 @@ def test_clocks_that_agree_are_not_warned_of():
     severity, message, values = rig.runtime.report()
     assert (severity, message) == (Severity.OK, 'commands sent in time')
     assert abs(float(values['clock_offset_ms'])) <= float(values['clock_offset_error_ms'])
+
+
+def test_a_planner_with_a_plan_to_replace_rests_while_its_device_is_away():
+    rig = Bench()
+    rig.runtime.request(trajectory((1.2, HOLD), (1.1, HOLD)))
+    rig.run(START + 400 * MS)
+    rig.linked = False
+    rig.run(START + 2000 * MS)
+    rig.runtime.following.replan('a')
+    assert rig.runtime.wake > rig.now
+
+
+def test_nobody_is_asked_whether_a_device_reports_that_has_given_receipts():
+    rig, asked = Bench(), []
+    rig.runtime.request(trajectory((1.2, HOLD)))
+    rig.run(START + 400 * MS)
+    rig.runtime.environment.reports = asked.append
+    rig.runtime.request(StretchRequest('a', 1.1))
+    rig.run(START + 800 * MS)
+    assert (asked, rig.status.verdict.code) == ([], 'accepted')

@@ -291,10 +291,14 @@ class PlannerNode(ManagedNode):
         if not self._channels:
             # Cleaned up, while the loop of a controller continues.
             return
+        begun = monotonic_ns()
         self._take(self._runtime.tick(self.now()))
         if not self.linked:
             self._listen()
             self._pace(soon=self._read_samples())
+            if monotonic_ns() - begun > _POLL_NS and not self._poll.is_canceled():
+                # Else, it would be called again at once, and what has arrived not be read.
+                self._poll.reset()
 
     def _serve_soon(self) -> None:
         """Serve within a period, since frequent messages are not served one by one."""

@@ -163,15 +163,20 @@ class _Joint:
     def open_next(self) -> None:
         """Watch the next setpoint."""
         number, self.following = self.following, self.following + 1
-        if number not in self.left:
-            return
-        for hold in self.holds:
+        if number in self.left:
+            self.forget()
+            self.holds.append(self._hold(number))
+
+    def forget(self, last: int = 0) -> None:
+        """Keep only the finding of setpoints that are over, except of the ``last`` ones."""
+        end = len(self.holds) - last
+        for hold in self.holds[:end]:
             if hold.over:
                 self.close(hold.found)
-        self.holds = [x for x in self.holds if not x.over or x.unreported]
+        self.holds = [x for i, x in enumerate(self.holds)
+                      if not x.over or x.unreported or i >= end]
         self.moves = {x: self.moves[x] for y in self.holds
                       if (x := y.setpoint.number - 1) in self.moves}
-        self.holds.append(self._hold(number))
 
     def restart_holds(self) -> None:
         """Restart gathering samples of unfinished setpoints, since all times have changed."""
@@ -475,8 +480,8 @@ class ArrivalMonitor:
             return
         if stamp > self._now:
             self._now = self._around.clock()
-        for joint in self._watched:
-            for hold in joint.holds if joint.key == name else ():
+        for joint in (*(x for x in self._replaced if x.key == name), self._joints[name]):
+            for hold in joint.holds:
                 hold.add(stamp, stretch, self._now)
 
     def judge(
@@ -512,6 +517,7 @@ class ArrivalMonitor:
                     self._tell(joint, hold.requested, found)
                 if found is not None and current:
                     joint.newest = found
+                    joint.forget(last=1)
                     return found
         self._replaced = [x for x in self._replaced if x.open or x.begins is not None]
         return None

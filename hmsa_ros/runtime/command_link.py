@@ -352,8 +352,9 @@ class CommandLink:
         # After a loss, a heartbeat shows whether commands arrive again.
         lost = [x for x in self._planners if self.receipts.lost(
             x, *((0,) if x in self.cut or self._following.lost(x) else ()))]
+        # Asking the middleware takes far longer than looking up.
         owed = any(
-            self._around.reports(x) and not self.receipts.knows(x) for x in self._planners)
+            not self.receipts.knows(x) and self._around.reports(x) for x in self._planners)
         if not (lost or self.cut or owed) and all(
                 level[1] != 0.0 or self.receipts.since(name, level[0])
                 for name, level in self._following.newest.items() if name in names):

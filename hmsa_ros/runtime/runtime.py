@@ -416,7 +416,7 @@ class Runtime:
             self.follower.wake]
         if self.settings.heartbeat_period:
             times.append(self._next_beat)
-        if self.following.astray or self.following.verdicts:
+        if self.following.astray - self.devices.receipts.silent or self.following.verdicts:
             times.append(0)
         if self.following.advises:
             times.append(now + LOOK)
