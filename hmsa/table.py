@@ -72,6 +72,7 @@ class Table:
     rows: tuple[tuple[Any, ...], ...]
     caption: str = ''
     notes: tuple[str, ...] = ()  #: one sentence each
+    legend: tuple[tuple[str, str], ...] = ()  #: headings, and what they mean
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -118,8 +119,13 @@ class Table:
                 [heads[i] for i in block], [[row[i] for i in block] for row in texts],
                 [right[i] for i in block])
         room = max(shutil.get_terminal_size().columns, 60)
-        for text in (self.caption, *(f'note: {x}' for x in self.notes)):
-            lines += textwrap.wrap(text, room, break_long_words=False, break_on_hyphens=False)
+        wide = max((len(x) for x, _ in self.legend), default=0) + len(_GAP)
+        for text, indent in (
+                (self.caption, 0), *((f'{x:<{wide}}{y}', wide) for x, y in self.legend),
+                *((f'note: {x}', 0) for x in self.notes)):
+            lines += textwrap.wrap(
+                text, room, subsequent_indent=' ' * indent, break_long_words=False,
+                break_on_hyphens=False)
         return '\n'.join(lines)
 
     def _keys(self) -> int:
@@ -142,6 +148,7 @@ class Table:
             f'<table class="dataframe">{caption}'
             f'<thead>{row([x.title for x in self.columns], "th")}</thead><tbody>'
             + ''.join(row(x, 'td') for x in self._texts()) + '</tbody></table>'
+            + ''.join(f'<div><b>{escape(x)}</b>: {escape(y)}</div>' for x, y in self.legend)
             + ''.join(f'<p>{escape(x)}</p>' for x in self.notes))
 
     def _right(self) -> list[bool]:

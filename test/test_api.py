@@ -7,6 +7,7 @@ import json
 import math
 from pathlib import Path
 import pickle
+import re
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -672,6 +673,17 @@ def test_an_overdamped_step_arrives_without_ringing_and_a_setpoint_cut_off_has_a
     assert cut.report()['verdict'] == ['arrived', 'unobserved']
     assert cut.report().notes == (said,)
     assert hmsa.compare(cut, cut).notes[1] == f'simulated (2), {said}'
+
+
+def test_what_columns_mean_is_a_list_below_the_table(block):
+    table = block.amplifiers([(1.1, 0.5)], slew_limits=[10.0], bandwidths=[])
+    lines = str(table).splitlines()
+    headings = [x.name for x in table.columns]
+    listed = {x: text for x, text in table.legend if x in headings}
+    assert list(listed) == ['slew', 'bandwidth', 'lost', 'field']
+    for heading, text in listed.items():
+        assert any(re.fullmatch(rf'{heading} +{re.escape(text)}', x) for x in lines)
+        assert f'<b>{heading}</b>: {text}' in table._repr_html_()
 
 
 @pytest.mark.parametrize('where', ['notebook', 'terminal'])

@@ -879,7 +879,7 @@ def test_a_type_of_another_definition_is_told(tmp_path, role):
 
 
 def test_samples_of_another_definition_are_no_run(tmp_path):
-    with pytest.raises(BadInputError, match='can be used: .*; a message of topic /joint_st'):
+    with pytest.raises(BadInputError, match='no usable message: .*; a message of topic /joint_st'):
         read_runs(of_another_definition(tmp_path / 'bag', JOINT_STATES))
 
 
@@ -1376,7 +1376,7 @@ def _bad(tmp_path, case):
             for role in (JOINT_STATES, COMMAND):
                 encoding, text = message_definition(TYPES[role])
                 writer.add_topic(BagTopic(f'/{role}', TYPES[role], text, encoding))
-        return [str(tmp_path / 'bag')], 'no message'
+        return [str(tmp_path / 'bag')], 'no usable message'
     if case == 'no folder to write to':
         return [str(good), '--out', str(tmp_path / 'no' / 'x.html')], 'is no folder'
     if case == 'a folder to write':

@@ -26,15 +26,15 @@ _DECADE = (1.0, 2.0, 5.0)
 _COIL = {'inductance': 'H', 'resistance': 'ohm', 'tesla_per_ampere': 'T/A'}
 # Columns and their descriptions; the last four need data of the coil, the last two all of them.
 _COLUMNS = (
-    (Column('slew', 'T/s', '.4g'), 'of ramps'),
-    (Column('bandwidth', 'Hz', '.4g'), 'of a first-order lag'),
+    (Column('slew', 'T/s', '.4g'), 'slew rate of the ramps'),
+    (Column('bandwidth', 'Hz', '.4g'), 'that of a first-order lag'),
     (Column('longest move', 'ms', '.4g'), ''),
-    (Column('lost', 'ms', '.3g'), 'against ideal steps, in the longest move'),
+    (Column('lost', 'ms', '.3g'), 'additional time of the longest move, relative to ideal steps'),
     (Column('field', 'mT', '.4g'), 'largest magnitude of a level'),
-    (Column('current', 'A', '.3g'), 'that of this field'),
+    (Column('current', 'A', '.3g'), 'current of this field'),
     (Column('change', 'A/s', '.3g'), 'largest rate of the current'),
-    (Column('voltage', 'V', '.3g'), 'L dI/dt + R I, its largest magnitude'),
-    (Column('power', 'W', '.3g'), 'that voltage times the largest current'))
+    (Column('voltage', 'V', '.3g'), 'largest magnitude of L dI/dt + R I'),
+    (Column('power', 'W', '.3g'), 'this voltage times the largest current'))
 
 
 def amplifiers(
@@ -95,9 +95,8 @@ def amplifiers(
         rows.append(_row(plan, best, slew, band, coil))
     shown = _COLUMNS[:len(rows[0])]
     return Table(
-        tuple(x for x, _ in shown), tuple(rows), '; '.join(
-            ['∞: no limit', *(f'{x.name}: {words}' for x, words in shown if words)]),
-        tuple(notes))
+        tuple(x for x, _ in shown), tuple(rows), '∞: no limit', tuple(notes),
+        tuple((x.name, words) for x, words in shown if words))
 
 
 def _series(middle: float) -> list[float]:

@@ -253,8 +253,9 @@ def _along(actuator: 'Actuator', arguments: argparse.Namespace) -> int:
     return show(
         arguments, record, Table(
             tuple(columns), (tuple(row),),
-            'deviation: maximum distance of a simulation from the path; ' + _caption(actuator),
-            tuple(x for y in plan.segments for x in y.notes())), written=[arguments.out])
+            _caption(actuator), tuple(x for y in plan.segments for x in y.notes()),
+            (('deviation', 'maximum distance of a simulation from the path'),)),
+        written=[arguments.out])
 
 
 def _more(arguments: argparse.Namespace) -> dict[str, Any]:

@@ -53,10 +53,11 @@ def comparison(parts: Sequence[Part]) -> Table:
         if number < len(part.evaluation.findings)]
     return Table(
         (Column('setpoint'), Column('run'), *_MEASURED, Column('apart', '%', '%')), tuple(rows),
-        f'{_CAPTION}; apart: largest distance from the curve of {labels[0]}, from the start of '
-        'the move on; in % of the step', tuple(
+        _CAPTION, tuple(
             f'{label}, {note}' for label, part in zip(labels, parts, strict=True)
-            for note in _open(part)))
+            for note in _open(part)), (*_LEGEND, (
+                'apart', f'largest distance from the curve of {labels[0]} after the start of the '
+                'move')))
 
 
 def setpoints(parts: Sequence[Part]) -> Table:
@@ -67,8 +68,8 @@ def setpoints(parts: Sequence[Part]) -> Table:
             f'{x.setpoint.joint} {x.setpoint.number}' if x.setpoint.joint else x.setpoint.number,
             *_measured(part, number), x.frequency)
             for part in parts for number, x in enumerate(part.evaluation.findings)),
-        f'{_CAPTION}; f: frequency of the vibration; in % of the step',
-        tuple(note for part in parts for note in _open(part)))
+        _CAPTION, tuple(note for part in parts for note in _open(part)),
+        (*_LEGEND, ('f', 'frequency of the vibration')))
 
 
 def _open(part: Part) -> list[str]:
@@ -91,12 +92,15 @@ _MEASURED = (
     Column('judged from', 'ms', '.4g'), Column('offset', '%', '+%'),
     Column('offset std', '%', '%', DEVIATION), Column('vibration', '%', '%'),
     Column('vibration std', '%', '%', DEVIATION))
-_CAPTION = (
-    'move time: from the first level to planned rest, half a period for an unshaped step; '
-    'settled: from then on it stays within arrival_tolerance of the target; residual: peak to '
-    'peak after the move time; judged from: start of the samples that decide the verdict, for an '
-    'unshaped step once its vibration should have faded; offset: their mean less the target; '
-    'vibration: peak to peak in their first period; ±: standard deviations')
+_CAPTION = 'percentages are of the step'
+_LEGEND = (
+    ('move time', 'from the first level to planned rest; half a period for an unshaped step'),
+    ('settled', 'time after which the stretch stays within arrival_tolerance of the target'),
+    ('residual', 'peak to peak after the move time'),
+    ('judged from', 'start of the samples that decide the verdict; for an unshaped step, after '
+                    'its vibration should have decayed'),
+    ('offset', 'mean of these samples minus the target'),
+    ('vibration', 'peak to peak in their first period'), (DEVIATION, 'standard deviation'))
 
 
 def _measured(part: Part, number: int) -> tuple[float | str, ...]:

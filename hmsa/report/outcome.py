@@ -128,6 +128,7 @@ def level_table(levels: Sequence[LevelResult]) -> Table:
             Column(x, '', '.5f') for x in ('rest', 'mean', 'least', 'greatest'))), tuple(
         (*([x.joint] if several else []), x.flux_density * 1e3, x.times, x.duration * 1e3,
          x.rest, x.mean, x.least, x.greatest) for x in chosen),
-        'rest: the stretch that the level holds by the parameters; mean, least and greatest: '
-        'while it was in force; the last row is the end' + (
-            f'; {short} short ones are left out' if short else ''))
+        'the last row is the end' + (
+            f'; {short} short levels are left out' if short else ''), legend=(
+                ('rest', 'stretch that the level holds, according to the parameters'),
+                ('mean, least, greatest', 'stretches while the level was in force')))

@@ -50,8 +50,9 @@ def run(arguments: argparse.Namespace) -> int:
          Column('offset', '%', '+%')),
         tuple((str(x), f'{y:g}', 100.0 * vibration, 100.0 * offset)
               for x, y, vibration, offset in rows),
-        'vibration: peak to peak in the first period after the move; offset: mean less the '
-        'setpoint; in % of the step')]
+        'percentages are of the step', legend=(
+            ('vibration', 'peak to peak in the first period after the move'),
+            ('offset', 'mean minus the setpoint')))]
     lines.append('the moves end ' + ', '.join(
         f'{x - y.begin:.3g}' for x, y in zip(found.rests, targets, strict=True))
         + ' s after their begin')

@@ -222,11 +222,12 @@ def _print_table(case: 'Case', results: 'list[Result]', unit: float | None) -> N
         box=SIMPLE_HEAD,
         title=f'{case.material.coordinate.name} {case.start:g} to {case.target:g}, '
               f'{case.nominal}',
-        caption=f'residual: peak-to-peak {case.material.coordinate.name} after arrival in % of '
-                f'the step, without the steady-state error; worst case within {error} % of error, '
-                'in the last column for all errors at once; arrival in '
+        caption=f'nominal: residual vibration, the peak-to-peak {case.material.coordinate.name} '
+                'after arrival in % of the step, without the steady-state error\n'
+                f'parameters, all: its worst case for errors of up to {error} % in one parameter, '
+                'and in all at once\narrival: in '
                 + ('ms' if unit else 'L sqrt(rho/G)' if case.material.law is None
-                   else 'units of time'))
+                   else 'units of time'), caption_justify='left')
     table.add_column('shaper', no_wrap=True)
     for name in ('arrival', 'nominal', *case.parameters, 'all'):
         table.add_column(name, justify='right', no_wrap=True)
