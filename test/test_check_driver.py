@@ -137,6 +137,17 @@ def test_calls_that_a_busy_host_slows_down_are_not_blamed_on_the_class(slow, of,
     assert [x.passed for x in trial._checks] == [passed]
 
 
+@pytest.mark.parametrize(('spacing', 'slept', 'passed'), [
+    (0.005, 0.0, True), (0.0115, 0.0, False), (0.0115, 0.006, True), (0.03, 0.006, False)])
+def test_samples_that_a_busy_host_delays_are_not_called_lost(spacing, slept, passed):
+    trial = conformance.ConformanceTrial('', '', {}, level=1e-3, rate=200.0)
+    seen = PhaseResults([], [
+        Sample(round(1e9 * spacing * i), np.array([1.0 + 1e-4 * i]), np.array([0.0]),
+               np.array([0.0])) for i in range(200)], [])
+    trial._check_samples([seen], seen, [slept] * 100)
+    assert [x.passed for x in trial._checks if x.name == 'samples_lost'] == [passed]
+
+
 def phase(stretch):
     """Return a phase whose samples have these stretches."""
     return PhaseResults([], [Sample(i, np.array([x]), np.array([0.0]), np.array([0.0]))
@@ -161,7 +172,7 @@ def test_a_sensor_that_a_level_moves_by_a_few_steps_is_not_said_to_repeat(step, 
     moving = 1.0 + np.repeat([5e-4, 1e-3] * 15, 6) + 1e-5 * dice.standard_normal(180)
     trial = conformance.ConformanceTrial('', '', {}, level=1e-3, rate=200.0)
     seen = phase(step * np.round(moving / step))
-    trial._check_samples([seen], seen)
+    trial._check_samples([seen], seen, [0.0])
     assert ('samples_new' in {x.name for x in trial._checks if x.passed}) is tried
     assert ('samples_new' in ''.join(trial._untried)) is not tried
 
