@@ -42,6 +42,13 @@ def test_verdict_is_the_truth(motion, verdict):
         motion.get('vibration', 0.0), abs=0.5)
 
 
+@pytest.mark.parametrize(('offset', 'said'), [
+    (1e-12, 'rests at 1.4'), (0.5, 'above 1.4'), (-0.5, 'below 1.4')])
+def test_a_distance_that_is_rounding_is_called_none_where_there_is_no_step(offset, said):
+    found = judge(*held(offset=offset, vibration=0.0, noise=1e-6), setpoint(start=1.4))
+    assert said in found.message
+
+
 @pytest.mark.parametrize('motion', [
     {'offset': 3.0, 'noise': 2.5}, {'vibration': 5.0, 'decay': 0.0, 'noise': 1.0}])
 def test_what_is_beyond_is_never_called_arrived(motion):

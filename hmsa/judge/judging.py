@@ -53,6 +53,8 @@ _ADVISED = 1.5
 _REPEATED = 3
 # Changes between samples, relative to the step, that belong to a motion that fades.
 _FADED = 1e-9
+# Distance from a target without a step that is rounding, in stretch.
+_SAME = 1e-6
 # Size of a mode, relative to the largest, from which it is named.
 _SHOWN = 0.2
 # Number of changes below which the rounding of a sensor is not tested.
@@ -390,6 +392,8 @@ def _open(
 
 def _distance(offset: float, setpoint: RequestedSetpoint) -> str:
     direction = setpoint.target - setpoint.start
+    if math.isnan(setpoint.percent(offset)) and abs(offset) < _SAME:
+        return f'at {setpoint.target:.6g}'
     if math.isnan(setpoint.percent(offset)):
         side = 'below' if offset < 0.0 else 'above'
     else:
