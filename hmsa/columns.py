@@ -35,7 +35,7 @@ _LENGTHS = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3, 'um': 1e-6, 'µm': 1e-6}
 _SUFFIXES = ('s', 'ms', 'us', 'ns', 't', 'mt', 'a', 'ma', 'm', 'cm', 'mm')
 # A row of units may have these below a number without a unit.
 _DIMENSIONLESS = ('', '1', '-')
-_DIVIDE = 'divide it by the length at rest, or give that: hmsa identify --rest-length 20mm'
+_DIVIDE = 'divide it by the length at rest, or name that: hmsa identify --rest-length 20mm'
 _MISSING = frozenset((
     '', 'nan', 'na', 'n/a', 'null', 'none', '-', '--', '\u2013', '\u2014',
     # Errors of a spreadsheet.
@@ -308,7 +308,7 @@ def _of_another(cells: list[str]) -> str:
     names = ' '.join(cells).lower()
     if 'strain' in names:
         return '; stretch is strain plus 1'
-    return f'; of a length, {_DIVIDE}' if re.search('length|mm', names) else ''
+    return f'; for a length, {_DIVIDE}' if re.search('length|mm', names) else ''
 
 
 def _taken(

@@ -741,6 +741,9 @@ def test_a_law_is_chosen_by_option(files, capsys):
     (['plan', '1.1:1', '--inductance', '-5mH'], 'expected more than 0 H'),
     (['init', '--beam', '--law', 'yeoh:c10=1kPa', '--yes', '--out', 'b.yaml'], 'with --beam'),
     (['init', '--law', 'yeoh:c10=1kPa', '--j-lim', '5', '--yes', '--out', 'b.yaml'], 'constants'),
+    (['wave', 'tringle', '--frequency', '5', '--amplitude', '0.05'],
+     "the shape is 'tringle': expected square, sine, triangle, sweep, or a CSV with the columns "
+     'time and stretch; did you mean triangle?'),
     (['simulate', 'nothing.csv'], 'nothing.csv cannot be read'),
     (['simulate', 'levels.csv', '--noise', '-1'], 'noise is -1'),
     (['simulate', 'levels.csv', '--out', 'run.txt'], 'expected a name that ends in .csv'),

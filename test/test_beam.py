@@ -180,7 +180,7 @@ def test_a_parameter_file_of_a_beam_plans_its_deflection_to_both_sides(tmp_path,
     assert main([*words, '--joint', 'tip']) == 0
     told = capsys.readouterr()
     assert 'coil holds deflections     -0.74295 to 0.74295' in told.out
-    assert 'lying, the beam sags by 0.46 of its length' in told.err
+    assert 'a horizontal beam sags by 0.46 of its length' in told.err
     assert main(['plan', '-0.2:1', '0.3:1', '--params-file', str(file), '--json']) == 0
     first, second = json.loads(capsys.readouterr().out)['segments']
     beam = silicone()

@@ -207,7 +207,8 @@ def test_a_planner_drops_its_plan_refuses_and_waits_to_be_asked(reaction, monkey
     sent = len(rig.sent)
     verdict = rig.runtime.request(StretchRequest('a', 1.3))
     assert verdict.code == 'interlock'
-    assert 'close it (~/interlock of the driver), then send a new request' in verdict.message
+    assert verdict.message.endswith(
+        'close the interlock (~/interlock of the driver), then send a new request')
     assert rig.runtime.request(Stop()).code != 'interlock'
     rig.run(rig.now + 1000 * MS)
     rig.door = False

@@ -107,7 +107,7 @@ EXPLANATIONS: Mapping[Code, tuple[str, str]] = {
         'Send the request again: it starts from the current state. With after_cut_off resume the '
         'planner continues by itself.'),
     Code.INTERLOCK: (
-        'The interlock of the driver is open, or its hardware out of reach '
+        'The interlock of the driver is open, or its hardware is out of reach '
         '(`hardware.reconnect`): the coil is off, and the rest of the sequence was dropped.',
         'Close the interlock or plug the cable in, then send the request again. Nothing continues '
         'by itself.'),

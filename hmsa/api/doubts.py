@@ -92,7 +92,7 @@ def _of_sizes(form: str, values: Mapping[str, float]) -> Iterator[str]:
             values['youngs_modulus'] * values['thickness'] ** 2)
         if sag > _SAG:
             yield (
-                f'lying, the beam sags by {sag:.2g} of its length under its own weight, which '
+                f'a horizontal beam sags by {sag:.2g} of its length under its own weight, which '
                 'the model neglects: clamp it so that it bends in a horizontal plane')
     if form == 'block':
         ratio = values['half_thickness'] / values['half_length']

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from hmsa.cli.options import actuator_of, add_command, EXAMPLE, frequency, JSON, show
-from hmsa.errors import BadInputError
+from hmsa.errors import BadInputError, meant
 from hmsa.files import check_targets
 
 if TYPE_CHECKING:
@@ -60,6 +60,11 @@ def run(arguments: argparse.Namespace) -> int:
         shape = {'time': times, 'stretch': stretches}
     elif shape == 'sweep':
         shape = 'sine'
+    elif shape not in SHAPES:
+        known = (*SHAPES, 'sweep')
+        raise BadInputError(
+            f'the shape is {shape!r}: expected {", ".join(known)}, or a CSV with the columns time '
+            'and stretch' + meant(shape, known))
     if arguments.path is not None:
         _write_path(arguments, actuator, shape)
     bands = actuator.wave_bands(shape, arguments.amplitude, arguments.offset)

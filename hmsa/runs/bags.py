@@ -125,7 +125,8 @@ def read_run(
     if len(runs) > 1:
         raise BadInputError(
             f'{path} has the runs {", ".join(x.label for x in runs)}: expected one; ' + (
-                'name its actuator (--joint)' if len({x.joint for x in runs}) == len(runs)
+                f'name its actuator, as in --joint {runs[0].joint} or joint={runs[0].joint!r}'
+                if len({x.joint for x in runs}) == len(runs)
                 else 'record the topics of one namespace in a bag'))
     return runs[0]
 

@@ -239,8 +239,8 @@ class CommandLink:
         """Return the refusal of a request for a joint that is locked."""
         return RefusedError(
             Code.INTERLOCK, f'the interlock of the driver of joint {joint} is open, or its '
-            'hardware out of reach (/diagnostics), and its coil off; close it (~/interlock of the '
-            'driver), then send a new request')
+            'hardware is out of reach (see /diagnostics), so the coil is off: close the interlock '
+            '(~/interlock of the driver), then send a new request')
 
     def check(self, joints: Iterable[str]) -> None:
         """
