@@ -319,7 +319,8 @@ class Rig:
         end = monotonic() + patience
         while not condition():
             if monotonic() > end:
-                raise HmsaError(f'waited {patience:g} s for {what}')
+                last = f'; the last status: {self.verdicts[-1]}' if self.verdicts else ''
+                raise HmsaError(f'waited {patience:g} s for {what}{last}')
             self._executor.spin_once(timeout_sec=_SLICE)
 
     def spin(self, seconds: float) -> None:
