@@ -128,7 +128,7 @@ def _summary(parts: Sequence[Part]) -> list[tuple[str, str]] | Table:
         return max((x for x in values if math.isfinite(x)), default=math.nan)
 
     header = [
-        'setpoints arrived', 'largest residual, share of the step', 'the same with unshaped steps',
+        'setpoints arrived', 'largest residual, of the step', 'the same with unshaped steps',
         'commands', 'samples a second', 'messages lost']
     rows = [[
         f'{sum(y.arrived for y in x.evaluation.findings)} of {len(x.evaluation.findings)}',
@@ -136,7 +136,7 @@ def _summary(parts: Sequence[Part]) -> list[tuple[str, str]] | Table:
         f'{percent(largest(y.residual_unshaped for y in x.evaluation.results))} %',
         f'{len(x.timing.commands)}' + (
             f' ({x.timing.late} late)' if len(x.timing.lead) or len(x.timing.lateness) else ''),
-        f'{1.0 / np.median(x.timing.interval):.6g}' if len(x.timing.interval) else '–',
+        f'{1.0 / np.median(x.timing.interval):.4g}' if len(x.timing.interval) else '–',
         'not counted' if x.run.summary is None or x.run.summary.lost is None
         else str(x.run.summary.lost)] for x in parts]
     if len(parts) == 1:

@@ -21,7 +21,7 @@ function put(element, text) {
 }
 
 function number(value, digits) {
-  return value === null || value === undefined ? '?' : value.toFixed(digits).replace('-', '\u2212');
+  return value === null || value === undefined ? '–' : value.toFixed(digits).replace('-', '\u2212');
 }
 
 // Gives the parent one child for each item, filled with its item. Received text is never HTML.
@@ -101,8 +101,10 @@ function interlock() {
 function status() {
   const request = frame.request;
   $('level').className = `level ${request ? request.level : ''}`;
-  put($('level'), request ? request.level : '?');
-  put($('message'), request ? request.message : 'no status yet');
+  $('level').hidden = !request;
+  put($('level'), request ? request.level : '');
+  put($('message'), request ? request.message
+    : frame.waiting.length ? '' : 'No request yet: choose a target and press Go, or send a sequence.');
   const finding = request && !request.message.includes(request.finding) ? request.finding : '';
   $('finding').hidden = !finding;
   put($('finding'), finding);
@@ -116,9 +118,9 @@ function joint(card, seen) {
   put(card.querySelector('h2'), seen.name);
   const texts = {
     name, label: name, stretch: number(seen.stretch, 5), target: number(seen.target, 5),
-    error: seen.stretch === null || seen.target === null ? '?'
+    error: seen.stretch === null || seen.target === null ? '–'
       : (seen.stretch - seen.target).toExponential(1).replaceAll('-', '\u2212'),
-    flux: seen.flux_density === null ? '?'
+    flux: seen.flux_density === null ? '–'
       : `${number(1e3 * seen.flux_density, 2)} mT`};
   for (const place of card.querySelectorAll('[data-of]')) put(place, texts[place.dataset.of]);
   const kept = charts[seen.name];
