@@ -107,6 +107,34 @@ for _seconds in (2.0, 25.0):
 
 
 @FAULTS.fault(
+    'hosts_stop', '`hmsa stop` while commands do not arrive',
+    'network namespaces; commands lost in mid-sequence, from before the stop until after it',
+    'exit 1, which names the missing acknowledgement; at rest once commands arrive')
+def _stop(rig: Rig) -> Seen:
+    if why := unavailable():
+        return Seen(f'not tried: {why}', '-', met=True)
+    with hosts('bench', 'desk') as made:
+        apart = _Apart(rig, made)
+        apart.node('bench', 'plant')
+        apart.node('desk', 'planner')
+        onlooker = apart.look_on('bench')
+        apart.send('desk', '1.1:1', '--wait')
+        apart.send('desk', *('1.2:0.4', '1.35:0.4') * 20)
+        sleep(1.0)
+        made.lose('desk', 'bench')
+        stop = apart.node('desk', 'stop')
+        status = stop.popen.wait(PATIENCE)
+        made.find('desk', 'bench')
+        sleep(3.0)
+        still = apart.seen(onlooker)[2][-500:]
+    named = 'has not acknowledged' in stop.said
+    vibration = float(np.ptp(still)) / 0.15
+    return Seen(
+        f'exit {status}, {"named" if named else "not named"}; then at {still[-1]:.4f}',
+        f'{vibration:.1e}', status == 1 and named and vibration < 1e-3)
+
+
+@FAULTS.fault(
     'hosts_address', 'host of the plant comes back with another address',
     'network namespaces; link down at 1.35, safe_flux zero; a request of 1.2, again after a '
     'restart of the plant',

@@ -2,7 +2,7 @@
 
 import signal
 
-from benchmarks.faults.common import await_change, jump, move, pair, Register, share
+from benchmarks.faults.common import await_change, jump, LIMIT, move, pair, Register, share
 from benchmarks.faults.rig import Rig
 from benchmarks.faults.table import Seen
 from hmsa.interfaces import topics
@@ -59,6 +59,24 @@ for _fault, _name, _how, _expected, _word, _counter in (
         ('twice', 'doubled samples', 'each sent twice', 'skipped', '', ''),
         ('silence', 'silent sensor', 'no samples', 'open loop', '', '')):
     FAULTS.fault(
-        f'sensor_{_fault}', f'{_name}, adapt',        _how, _expected)(
+        f'sensor_{_fault}', f'{_name}, adapt', _how, _expected)(
             lambda rig, fault=_fault, word=_word, counter=_counter: _failing(
                 rig, fault, word, counter))
+
+
+@FAULTS.fault(
+    'sensor_pause', 'sensor silent for 1.5 s, open loop',
+    'three requests meanwhile; then its samples come at once', 'every move starts as predicted')
+def _pause(rig: Rig) -> Seen:
+    name = topics.JOINT_STATES.name
+    sensor = rig.run('sensor', '-m', 'benchmarks.faults.sensor', name, f'{name}_seen', 'swap')
+    pair(rig, remap={name: f'{name}_seen'})
+    move(rig, _TARGET, start=1.0)
+    sensor.send(signal.SIGSTOP)
+    for stretch in (1.4, 1.1, 1.05):
+        rig.setpoint(stretch)
+        rig.spin(0.5)
+    sensor.send(signal.SIGCONT)
+    residual, error = move(rig, 1.3, start=1.05)
+    return Seen(
+        f'status {rig.verdicts[-1]["code"]}', share(residual), max(residual, error) < LIMIT)
