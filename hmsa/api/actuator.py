@@ -27,7 +27,7 @@ from hmsa.api.arguments import (
 from hmsa.api.doubts import unquestioned, warn
 from hmsa.api.facts import facts
 from hmsa.api.mounting import mount_facts, with_mount
-from hmsa.errors import BadInputError, excerpt, meant
+from hmsa.errors import assume, BadInputError, excerpt, meant, UnusualWarning
 from hmsa.files import write_text, yaml_text
 from hmsa.interfaces.actuator import actuator_from, model_from, parameters_of
 from hmsa.interfaces.parameters import (
@@ -103,6 +103,11 @@ class Actuator:
         The paper's block, which deforms uniformly in motion, too; or as a continuum with its
         modes, free or with one face glued to a rigid support (`hmsa.model.continuum`). The shaper
         ``'modal'`` brings all modes to rest. ``'clamped'`` is for a beam, see `beam`.
+    thermal : mapping of str to float, optional
+        Temperature coefficients in 1/K of ``shear_modulus``, ``remanence``,
+        ``damping_coefficient`` and ``coil_resistance``, and the ``reference`` in degrees Celsius
+        at which all values hold (default 25), as the parameters ``thermal.*``; by default the
+        temperature changes nothing.
 
     Raises
     ------
@@ -138,7 +143,7 @@ class Actuator:
             creep: Sequence[tuple[float, float]] = (),
             flux_density_limits: float | tuple[float, float] = _STRONGEST,
             slew_limit: float = math.inf, coil_time_constant: float = 0.0,
-            mount: str = 'paper') -> None:
+            mount: str = 'paper', thermal: Mapping[str, float] | None = None) -> None:
         given = {
             'shear_modulus': shear_modulus, 'density': density, 'half_length': half_length,
             'half_thickness': half_length if half_thickness is None else half_thickness,
@@ -146,7 +151,7 @@ class Actuator:
             'damping_ratio': damping_ratio, 'damping_coefficient': damping_coefficient,
             'law': law, 'constants': constants, 'creep': creep,
             'flux_density_limits': flux_density_limits, 'slew_limit': slew_limit,
-            'coil_time_constant': coil_time_constant}
+            'coil_time_constant': coil_time_constant, 'thermal': thermal}
         if all(given[x] is None for x in DAMPED):
             zeta = ZETA
         #: Parameters that plans are made with.
@@ -412,9 +417,10 @@ class Actuator:
                 + meant(unknown[0], _KEYS))
         mount = parameters.pop('mount', 'paper')
         changed = parameters_in(parameters, self.law)
-        # A new model or new branches replace all previous ones.
+        # A new model, new branches or coefficients replace all previous ones.
         groups = ('law',) * (changed[LAW_NAME.name] != self.law) + (
-            'viscoelastic',) * ('creep' in parameters)
+            'viscoelastic',) * ('creep' in parameters) + (
+            'thermal',) * ('thermal' in parameters)
         zeta = self.zeta if parameters.get('zeta') is None else parameters['zeta']
         made = self._of(_model(
             {x: y for x, y in self.parameters.items()
@@ -462,6 +468,50 @@ class Actuator:
             f'mismatch.{name}': number(x, f'the factor on {name}') for name, x in factors.items()})
         return self._of(JointModel(replace(block, creep=self.block.creep), self.model.options))
 
+    def at_temperature(self, temperature: float) -> 'Actuator':
+        """
+        Return the actuator at a temperature, with ordinary parameters that hold there.
+
+        Parameters
+        ----------
+        temperature : float
+            Of block and coil, in degrees Celsius.
+
+        Returns
+        -------
+        Actuator
+            The same actuator with this temperature as the reference.
+
+        Raises
+        ------
+        BadInputError
+            If the actuator has no temperature coefficients, or for an impossible temperature.
+
+        Warns
+        -----
+        UnusualWarning
+            If the magnets may lose remanence for good.
+
+        Examples
+        --------
+        >>> from hmsa import Actuator
+        >>> block = Actuator(thermal={'shear_modulus': 3e-3, 'remanence': -1e-3})
+        >>> warm = block.at_temperature(40.0)
+        >>> round(warm.shear_modulus), round(1e3 * warm.flux_density(1.1), 2)
+        (10450, 36.68)
+
+        """
+        thermal, value = self.block.thermal, number(temperature, 'temperature', 'degC')
+        if not thermal:
+            raise BadInputError(
+                f'temperature is {value:g}, and the actuator has no temperature coefficients: '
+                "expected some, such as thermal={'shear_modulus': 3e-3, 'remanence': -1e-3}, or "
+                'thermal.* in the parameter file')
+        made = self._of(self.model.at_temperature(value), self._belief)
+        if words := thermal.warning(value):
+            assume(words, UnusualWarning)
+        return made
+
     # -- plans and motions ---------------------------------------------------------------------
 
     @suggesting
@@ -470,7 +520,7 @@ class Actuator:
             limits: float | tuple[float, float] | None = None, start: float | None = None,
             order: int = 2, errors: Sequence[float] | None = None, periods: float = 1.0,
             max_rate: float = math.inf, period: float = 0.0,
-            short_spell: str = 'refuse') -> 'Plan':
+            short_spell: str = 'refuse', temperature: float | None = None) -> 'Plan':
         """
         Plan a command without residual vibration.
 
@@ -496,6 +546,9 @@ class Actuator:
             Of the command grid in s; 0 for any time.
         short_spell : {'refuse', 'continue'}
             How to treat a duration that is shorter than the move.
+        temperature : float, optional
+            Temperature of the actuator in degrees Celsius, see `at_temperature`; default that at
+            which its parameters hold.
 
         Returns
         -------
@@ -521,6 +574,10 @@ class Actuator:
         """
         from hmsa.api.plan import Plan
 
+        if temperature is not None:
+            return self.at_temperature(temperature).plan(
+                setpoints, shaper, limits=limits, start=start, order=order, errors=errors,
+                periods=periods, max_rate=max_rate, period=period, short_spell=short_spell)
         model = self.model
         for name, word in (('shaper', shaper), ('short_spell', short_spell)):
             if not isinstance(word, str):

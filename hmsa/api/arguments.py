@@ -12,7 +12,7 @@ from typing import Any, ParamSpec, TypeVar
 import numpy as np
 
 from hmsa.errors import BadInputError, excerpt, meant
-from hmsa.interfaces.parameters import ACTUATOR, COIL_TIME_CONSTANT, LAW_NAME
+from hmsa.interfaces.parameters import ACTUATOR, COIL_TIME_CONSTANT, LAW_NAME, THERMAL
 from hmsa.model.equations import Array
 from hmsa.model.laws import LAWS
 from hmsa.model.moves import impossible
@@ -21,7 +21,7 @@ from hmsa.model.moves import impossible
 DAMPED = ('zeta', 'damping_ratio', 'damping_coefficient')
 # Arguments of `Actuator` that are single numbers, and those that may be None.
 _NUMBERS = {x.name.rpartition('.')[2]: x for x in (*ACTUATOR, COIL_TIME_CONSTANT)}
-_OPTIONAL = ('shear_modulus', 'half_thickness', *DAMPED, 'constants')
+_OPTIONAL = ('shear_modulus', 'half_thickness', *DAMPED, 'constants', 'thermal')
 # Shortest period of a command grid in s.
 _FINEST = 1e-9
 #: Alternative names of columns.
@@ -284,6 +284,8 @@ def parameters_in(given: Mapping[str, Any], law: str = 'gent') -> dict[str, Any]
         given.get('law', law), given.get('constants'), 'shear_modulus' in given)
     if 'creep' in given:
         values |= _creep_values(given['creep'])
+    if 'thermal' in given:
+        values |= _thermal_values(given['thermal'])
     if 'flux_density_limits' in given:
         values['flux_density_min'], values['flux_density_max'] = limits_of(
             given['flux_density_limits'])
@@ -329,6 +331,19 @@ def _creep_values(creep: Any) -> dict[str, Any]:
         return {}
     ratios, times = columns_of(creep, ('ratio', 'time'), 'branches of creep')
     return {'viscoelastic.ratio': ratios.tolist(), 'viscoelastic.time': times.tolist()}
+
+
+def _thermal_values(thermal: Any) -> dict[str, Any]:
+    """Return the parameters ``thermal.*`` of values by name."""
+    known = {x.name.partition('.')[2]: x for x in THERMAL}
+    values = {}
+    for name, value in mapping_of(thermal, 'thermal', "'remanence': -1e-3").items():
+        if name not in known:
+            raise BadInputError(
+                f'thermal has {excerpt(name)}: expected some of {", ".join(known)}'
+                + meant(str(name), known))
+        values[known[name].name] = number(value, f'thermal {name}', known[name].unit)
+    return values
 
 
 def limits_of(limits: Any) -> tuple[float, float]:

@@ -90,6 +90,17 @@ def of_unit(option: str, unit: str, text: str) -> Row:
     return option, 'X', argument(read), f'{text} [{unit}]'
 
 
+def temperature_option(text: str) -> Row:
+    """Return the option for a temperature in degrees Celsius, with or without the unit."""
+    def read(words: str) -> float:
+        from hmsa.interfaces.quantities import number_of
+        from hmsa.model.thermal import checked_temperature
+
+        return checked_temperature(number_of(words, 'degC', 'temperature'))
+
+    return '--temperature', 'T', argument(read), text
+
+
 def frequency(option: str, text: str, **settings: Any) -> Row:
     """Return an option for a frequency in Hz or with a unit."""
     def read(words: str) -> float:

@@ -22,6 +22,7 @@ from hmsa.cli.options import (
     MATERIAL,
     of_unit,
     show,
+    temperature_option,
 )
 from hmsa.cli.progress import progress
 from hmsa.cli.setpoints import setpoint
@@ -78,6 +79,9 @@ def add_parser(subparsers: Any) -> None:
          {'default': math.inf}),
         ('--params-file', 'YAML', Path,
          'parameter file (YAML) of planner and plant, for a plan in seconds and tesla'),
+        temperature_option(
+            'with --params-file: temperature of block and coil in degrees Celsius; the file has '
+            'the coefficients, thermal.* (default: that at which its values hold)'),
         of_unit('--tesla-per-ampere', 'T/A', 'field of the coil per current, for levels in A'),
         ('--amplifier',
          'with --params-file: also compare the move times and flux densities of amplifiers from '
@@ -143,7 +147,8 @@ def _in_units(arguments: argparse.Namespace) -> int:
 def _record(plan: 'Plan', per_ampere: float | None) -> dict[str, Any]:
     """Return a plan in seconds and tesla as JSON."""
     group, units = plan.actuator.model.material, plan.actuator.model.units
-    return {
+    thermal = plan.actuator.block.thermal
+    return ({'temperature': thermal.reference} if thermal else {}) | {
         'c1': group.c1, 'zeta': group.zeta, 'j_lim': group.j_lim, 'time_unit': units.time,
         'flux_density_unit': units.load,
         'segments': [_si_row(x, units, per_ampere) for x in plan.segments]}
@@ -151,7 +156,9 @@ def _record(plan: 'Plan', per_ampere: float | None) -> dict[str, Any]:
 
 def _caption(actuator: 'Actuator') -> str:
     group, unit = actuator.model.material, actuator.model.units.time
-    return (f'c1 {group.c1:.6g}, zeta {group.zeta:.6g}, time unit L sqrt(rho/G) {unit:.6g} s')
+    thermal = actuator.block.thermal
+    return (f'c1 {group.c1:.6g}, zeta {group.zeta:.6g}, time unit L sqrt(rho/G) {unit:.6g} s' + (
+        f', at {thermal.reference:g} degrees Celsius' if thermal else ''))
 
 
 def _without_dimension(arguments: argparse.Namespace) -> int:
@@ -165,6 +172,10 @@ def _without_dimension(arguments: argparse.Namespace) -> int:
     from hmsa.planning.shapers.request import as_errors, ERRORS, MoveRequest
     from hmsa.planning.shapers.smooth_limits import SmoothLimits
 
+    if arguments.temperature is not None:
+        raise BadInputError(
+            '--temperature is given: expected --params-file with it, since a temperature changes '
+            'parameters in SI units')
     if arguments.out is not None:
         raise BadInputError(
             '--out is given: expected --params-file with it, since the file has seconds and '
@@ -222,7 +233,9 @@ def _actuator(arguments: argparse.Namespace) -> 'Actuator':
         raise BadInputError(
             f'both --params-file and {", ".join(fixed)} are given: expected only one of them, '
             'since the file sets these values')
-    return Actuator.from_yaml(arguments.params_file)
+    actuator, given = Actuator.from_yaml(arguments.params_file), getattr(
+        arguments, 'temperature', None)
+    return actuator if given is None else actuator.at_temperature(given)
 
 
 def _along(actuator: 'Actuator', arguments: argparse.Namespace) -> int:

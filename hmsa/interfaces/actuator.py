@@ -5,7 +5,14 @@ from dataclasses import replace
 import math
 from typing import Any, TYPE_CHECKING
 
-from hmsa.interfaces.parameters import ACTUATOR_FIELDS, LAW, LAW_NAME, MODES, VISCOELASTIC
+from hmsa.interfaces.parameters import (
+    ACTUATOR_FIELDS,
+    LAW,
+    LAW_NAME,
+    MODES,
+    THERMAL,
+    VISCOELASTIC,
+)
 from hmsa.model.creep import Creep
 from hmsa.model.flows import FLOWS
 from hmsa.model.laws import LAWS
@@ -13,6 +20,7 @@ from hmsa.model.laws.beam import ELASTIC_CURVE
 from hmsa.model.laws.record import BEAM
 from hmsa.model.modes import Modes
 from hmsa.model.parameters import ActuatorParameters
+from hmsa.model.thermal import Thermal
 
 if TYPE_CHECKING:
     from hmsa.planning.timeline import JointModel
@@ -53,7 +61,7 @@ def actuator_from(
     modes = Modes(*(tuple(continuum.pop(f'modes.{x}')) for x in (
         'frequency_ratio', 'share', 'damping_ratio', 'ratio_exponent')))
     return ActuatorParameters(
-        law=elastic, modes=modes,
+        law=elastic, modes=modes, thermal=thermal_from(values),
         **{name.removeprefix('actuator.'): value for name, value in continuum.items()},
         **{name: value * values.get(f'mismatch.{name}', 1.0) for name, value in numbers.items()})
 
@@ -84,6 +92,12 @@ def planned_from(
     return replace(actuator_from(values, modulus), creep=creep_from(values))
 
 
+def thermal_from(values: Mapping[str, Any]) -> Thermal:
+    """Return the effect of the temperature by ``thermal.*``; none if there are no such values."""
+    return Thermal(**{
+        x.name.partition('.')[2]: values.get(x.name, x.default) for x in THERMAL})
+
+
 def creep_from(values: Mapping[str, Any]) -> Creep:
     """Return the branches of ``viscoelastic.*``; none if there are no such values."""
     given = {x.name: values.get(x.name, x.default) for x in VISCOELASTIC}
@@ -99,7 +113,7 @@ def parameters_of(actuator: ActuatorParameters) -> dict[str, Any]:
     values: dict[str, Any] = {
         f'actuator.{name}': value for name, value in actuator.numbers.items()}
     # What is as in the paper's model is not said.
-    values |= actuator.modes.parameters | {
+    values |= actuator.modes.parameters | actuator.thermal.parameters | {
         f'actuator.{name}': value for name, value in actuator.factors.items() if value != 1.0}
     if actuator.law is None:
         return values

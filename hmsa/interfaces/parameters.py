@@ -6,6 +6,7 @@ Parameters shared by nodes, files and reports: name, default, unit, range and de
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 import math
 import re
 from typing import Any
@@ -13,6 +14,7 @@ from typing import Any
 from hmsa.errors import BadInputError, excerpt
 from hmsa.model.flows import CONSTANTS, FLOWS
 from hmsa.model.laws import LAWS
+from hmsa.model.thermal import COLDEST, HOTTEST, Thermal
 
 #: Words that YAML reads as false or true unless quoted.
 WORDS = {False: ('off', 'no'), True: ('on', 'yes')}
@@ -251,8 +253,46 @@ MODES = (
         'constant ratios.', '', -5.0, 5.0, items=float),
 )
 
+_coefficient = partial(ParameterSpec, default=0.0, unit='1/K', minimum=-0.1, maximum=0.1)
+_celsius = partial(ParameterSpec, unit='degC', minimum=COLDEST, maximum=HOTTEST)
+
+#: Effect of the temperature, and warming by the coil.
+THERMAL = (
+    _celsius(
+        'thermal.reference', Thermal.reference,
+        'Temperature: at which all values of block and coil hold.'),
+    _coefficient(
+        'thermal.shear_modulus',
+        description='Temperature: relative change of the shear modulus, and of all moduli with '
+        'it, per K; 0 for none, as in the paper.'),
+    _coefficient(
+        'thermal.remanence',
+        description='Temperature: reversible relative change of the remanence per K; -0.001 for '
+        'NdFeB.'),
+    _coefficient(
+        'thermal.damping_coefficient',
+        description='Temperature: relative change of the damping coefficient per K.'),
+    _coefficient(
+        'thermal.coil_resistance',
+        description='Temperature: relative change of the resistance of the coil per K, 0.0039 for '
+        'copper; coil_time_constant is its inductance over it.'),
+    _celsius(
+        'thermal.limit', Thermal.limit,
+        'Temperature: above which the magnets may lose remanence for good, which is warned of.'),
+    ParameterSpec(
+        'thermal.rise', Thermal.rise,
+        'Temperature: by which the coil warms the block at a level that is held for long, over '
+        'the square of the level; 0 for a coil that does not.', 'K/T^2', 0.0, 1e9),
+    ParameterSpec(
+        'thermal.time_constant', Thermal.time_constant,
+        'Temperature: time constant of this warming.', 's', 1e-3, 1e9),
+    _celsius(
+        'thermal.ambient', Thermal.ambient,
+        'Temperature: without a field, until one is measured.'),
+)
+
 #: All parameters of a block.
-BLOCK = (*ACTUATOR, *LAW, *MODES)
+BLOCK = (*ACTUATOR, *LAW, *MODES, *THERMAL)
 
 JOINT = ParameterSpec(
     'joint', 'actuator', 'Name of the joint in trajectories and joint states.')

@@ -37,6 +37,7 @@ _UNITS: dict[str, dict[str, float]] = {
     'ohm': {'ohm': 1.0, 'mohm': 1e-3, 'Ω': 1.0},
     'T/A': {'T/A': 1.0, 'mT/A': 1e-3},
     'Hz': {'Hz': 1.0, 'kHz': 1e3},
+    'degC': {'degC': 1.0, 'C': 1.0, '°C': 1.0},
 }
 _NUMBER = re.compile(r'\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*')
 _NAME = re.compile(r'[A-Za-z](?:_?[A-Za-z0-9])*')

@@ -7,7 +7,7 @@ another, and an actuator alone moves bit for bit as it does among others.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 
 import numpy as np
@@ -66,6 +66,15 @@ class Setup:
                 f'time constant of the coil is {self.coil_time_constant:g} s: expected a '
                 'finite number of at least 0')
 
+    def at_temperature(self, temperature: float) -> 'Setup':
+        """Return it at a temperature in degrees Celsius, unchanged without coefficients."""
+        actuator = self.actuator.at_temperature(temperature)
+        if actuator is self.actuator:
+            return self
+        return replace(
+            self, actuator=actuator, coil_time_constant=self.coil_time_constant
+            / self.actuator.thermal.factor('coil_resistance', temperature))
+
     def holding(self, stretch: float) -> float:
         """Return the flux density in T that holds a stretch."""
         return float(
@@ -105,15 +114,10 @@ class Actuators:
         self.time = time
         blocks = [x.actuator for x in self.setups]
         count = len(blocks)
-        self._time_units = np.array([x.time_unit for x in blocks])
-        self._units = np.array([x.flux_density_unit for x in blocks])
+        self._time_units, self._units, self._lags = np.ones((3, count))
         self._scales = [x.units for x in blocks]
-        self._per_newton = [x.load_per_newton for x in blocks]
-        self._lags = np.array([
-            x.coil_time_constant / x.actuator.time_unit for x in self.setups])
+        self._per_newton = [0.0] * count
         self._slews = [0.0] * count
-        for i in range(count):
-            self.limit_slew(i, math.inf)
         self._material = law.stack([x.nondimensional.packed for x in blocks])
         self._state = np.zeros((count, 3))
         self._drive = np.zeros((count, 4))
@@ -122,21 +126,61 @@ class Actuators:
         self._durations = np.zeros(count)
         self._status = np.zeros(count, np.int64)
         self._all = np.ones(count, bool)
-        groups = [x.nondimensional.rows for x in blocks]
         self._branches = np.zeros((
-            count if any(map(len, groups)) else 0, motion.ROWS, motion.BRANCH))
+            count if any(len(x.nondimensional.rows) for x in blocks) else 0, motion.ROWS,
+            motion.BRANCH))
         # Actuators with secondary modes, and the place of the first row of these.
-        self._modes = {
-            i: (x.nondimensional, len(x.nondimensional.branches))
-            for i, x in enumerate(blocks) if x.nondimensional.modes}
-        for branches, group in zip(self._branches, groups, strict=False):
-            branches[:len(group)] = group
+        self._modes: dict[int, tuple[NondimensionalParameters, int]] = {}
+        for i, setup in enumerate(self.setups):
+            self._describe(i, setup)
+            self.limit_slew(i, math.inf)
         self.schedules = [CommandSchedule(0.0) for _ in blocks]
         self.forces = [CommandSchedule(0.0) for _ in blocks]
         self.changes: list[tuple[int, int, float]] = []
         for i in range(count):
             self.reset(i)
         self.changes.clear()
+
+    def _describe(self, i: int, setup: Setup) -> None:
+        """Take the scales and the material of one."""
+        block, group = setup.actuator, setup.actuator.nondimensional
+        self._time_units[i], self._units[i] = block.time_unit, block.flux_density_unit
+        self._scales[i], self._per_newton[i] = block.units, block.load_per_newton
+        self._lags[i] = setup.coil_time_constant / block.time_unit
+        self._material[i, :len(group.packed)] = group.packed
+        if len(self._branches):
+            self._branches[i, :len(group.rows)] = group.rows
+        if group.modes:
+            self._modes[i] = group, len(group.branches)
+
+    def set_temperature(self, i: int, setup: Setup, temperature: float) -> None:
+        """
+        Continue the motion of one with the parameters of a setup at a temperature.
+
+        ``setup`` has the values at its reference, the temperature is in degrees Celsius.
+        """
+        before, flux = self.setups[i].actuator, float(self.flux_density[i])
+        now = setup.at_temperature(temperature)
+        if now.actuator == before:
+            return
+        followed = self._branches[i, :, motion.FOLLOWER].copy() if len(self._branches) else None
+        self.setups = (*self.setups[:i], now, *self.setups[i + 1:])
+        self._describe(i, now)
+        # Rates are in units of time.
+        slower = now.actuator.time_unit / before.time_unit
+        self._state[i, 1] *= slower
+        self._slews[i] *= slower * before.flux_density_unit / now.actuator.flux_density_unit
+        if followed is not None:
+            self._branches[i, :, motion.FOLLOWER] = followed
+            if i in self._modes:
+                group, place = self._modes[i]
+                self._branches[
+                    i, place + 1:place + 2 * len(group.modes.ratios):2, motion.FOLLOWER] *= slower
+        # The field does not jump; a ramp goes on at the next step.
+        self._drive[i] = 0.0
+        if self._lags[i] > 0.0:
+            self._drive[i, 2] = (flux - self._levels[i]) / self._units[i]
+        self._begin_piece(i)
 
     def __len__(self) -> int:
         """Return the number of actuators."""

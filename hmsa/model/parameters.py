@@ -15,12 +15,13 @@ from hmsa.model.creep import Creep
 from hmsa.model.laws.coordinate import Coordinate, coordinate_of
 from hmsa.model.laws.record import Elastic, ELASTICA
 from hmsa.model.modes import Modes
+from hmsa.model.thermal import BLOCK_COEFFICIENTS, checked_temperature, Thermal
 from hmsa.model.units import MU_0, Units
 
 _ZERO_ALLOWED = ('zeta', 'damping_coefficient')
 # Infinite for neo-Hookean.
 _INFINITE_ALLOWED = ('j_lim', 'chain_limit')
-_NO_NUMBERS = ('law', 'creep', 'modes')
+_NO_NUMBERS = ('law', 'creep', 'modes', 'thermal')
 # Factors on the mass, which no recording of one mode can tell from other values.
 _FACTORS = ('mass_factor', 'transverse_mass_factor')
 # Scales and groups beyond this and its inverse belong to no block, and overflow in the equations.
@@ -249,6 +250,8 @@ class ActuatorParameters:
     transverse_mass_factor : float
         Factor on the transverse inertia of a block relative to the axial one, greater than 0, with
         the same inertia at rest; default 1.
+    thermal : Thermal
+        Temperature coefficients, and the reference at which the values hold; default none.
 
     Raises
     ------
@@ -269,6 +272,7 @@ class ActuatorParameters:
     modes: Modes = Modes()
     mass_factor: float = 1.0
     transverse_mass_factor: float = 1.0
+    thermal: Thermal = Thermal()
 
     def __post_init__(self) -> None:
         """Check the values, and that they give usable scales."""
@@ -326,6 +330,21 @@ class ActuatorParameters:
             creep=replace(material.creep, times=tuple(
                 x * cube.time_unit for x in material.creep.times)))
         return replace(made, damping_coefficient=material.zeta * made.damping_unit)
+
+    def at_temperature(self, temperature: float) -> 'ActuatorParameters':
+        """
+        Return the actuator at a temperature in degrees Celsius, which becomes the reference.
+
+        Without coefficients, and at the reference, it is the same actuator. Raise `BadInputError`
+        for an impossible temperature.
+        """
+        thermal = self.thermal
+        checked_temperature(temperature)
+        if not thermal or temperature == thermal.reference:
+            return self
+        changed: dict[str, Any] = {
+            x: getattr(self, x) * thermal.factor(x, temperature) for x in BLOCK_COEFFICIENTS}
+        return replace(self, thermal=thermal.at(temperature), **changed)
 
     @property
     def numbers(self) -> dict[str, float]:

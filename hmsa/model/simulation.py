@@ -308,9 +308,10 @@ class ActuatorSimulation:
             creep: Creep | None = None) -> None:
         """Start at rest."""
         self.actuator = actuator if creep is None else replace(actuator, creep=creep)
-        self._all = Actuators(
-            [Setup(self.actuator, actuator.rest if stretch is None else stretch, slew_limit,
-                   coil_time_constant)], time=time)
+        self._setup = Setup(
+            self.actuator, actuator.rest if stretch is None else stretch, slew_limit,
+            coil_time_constant)
+        self._all = Actuators([self._setup], time=time)
 
     @property
     def time(self) -> int:
@@ -350,6 +351,10 @@ class ActuatorSimulation:
             level: float | None = None) -> None:
         """Continue from another state, see `Actuators.set_state`."""
         self._all.set_state(0, stretch, rate, flux_density, level)
+
+    def set_temperature(self, temperature: float) -> None:
+        """Continue at a temperature in degrees Celsius, see `Actuators.set_temperature`."""
+        self._all.set_temperature(0, self._setup, temperature)
 
     def command(self, stamp: int, flux_density: float) -> int:
         """Take a command in T, see `Actuators.command`; return its lateness in ns."""
