@@ -24,6 +24,7 @@ from hmsa.planning.shapers.free import through
 from hmsa.planning.shapers.request import MoveRequest, Shaper
 from hmsa.planning.stopping import brake, holdable
 from hmsa.planning.timeline import Draft, JointModel, PlannedLevel, PlannedSegment, Timeline
+from hmsa.planning.warmth import Warmth
 
 #: Stretch, rate in 1/s and acceleration in 1/s^2; the acceleration is NaN if not given.
 PathPoint = tuple[float, float, float]
@@ -62,6 +63,8 @@ class PlanStart:
     #: Index of the first level of the plan whose prediction is no longer valid.
     stale: int | None = None
     check: Check = field(default=proceed, compare=False)
+    #: Temperature at the beginning; None if it changes nothing.
+    warmth: Warmth | None = None
 
 
 def check_points(
@@ -345,6 +348,10 @@ def draft_moves(
 
     With ``index``, they are those of the running plan from there on, which continues once met.
     """
+    if outset.warmth is not None:
+        return _warming(
+            outset, outset.warmth, setpoints, SHAPERS[shaper or outset.model.options.shaper],
+            first)
     model, planned = outset.model, outset.plan.segments
     levels: list[PlannedLevel] = []
     placed: list[PlannedSegment] = []
@@ -363,6 +370,84 @@ def draft_moves(
             placed += planned[following:]
             break
     return Draft(outset.begin, tuple(levels), tuple(placed))
+
+
+def draft_warmed(outset: PlanStart, index: int, held: PlannedSegment | None = None) -> Draft:
+    """
+    Draft the setpoints of the running plan from an index on again, for a temperature.
+
+    The first may be ``held``: it stays, and only the levels that hold it are new. Raise
+    `RefusedError` if the others cannot be carried out.
+    """
+    if outset.warmth is None:
+        raise ValueError('the temperature changes nothing')
+    return replace(_warming(
+        outset, outset.warmth, _left(outset, index), SHAPERS[outset.model.options.shaper],
+        held=held), resumed=index)
+
+
+def _warming(
+        outset: PlanStart, warmth: Warmth, setpoints: Iterable[Setpoint], shaper: Shaper,
+        first: Shaper | None = None, held: PlannedSegment | None = None) -> Draft:
+    """Draft setpoints, each for the temperature foreseen at its begin, with levels that follow."""
+    # Times count from the outset in its units, so that rounding does not add up.
+    model, begin, time = outset.model, outset.begin, 0.0
+    state, now = outset.state, warmth
+    levels: list[PlannedLevel] = []
+    placed: list[PlannedSegment] = []
+    upcoming = iter(setpoints)
+    setpoint = next(upcoming, None)
+    while setpoint is not None:
+        following = next(upcoming, None)
+        time += setpoint.span
+        end = math.inf if math.isinf(time) else outset.begin + outset.model.ns(time)
+        if placed:
+            outset.check()
+            now = now.along(levels[-1:], begin)
+            before, model = model, now.model(model)
+            state = model.held(
+                model.taken_from(state, before), before, levels[-1].flux_density)
+        if held is not None and not placed:
+            more, one = [_held(model, begin, held.stretch, state)], held
+        else:
+            span = math.inf if math.isinf(end) else model.time(int(end) - begin)
+            segment = next(segments(
+                _frame(model, state), [Setpoint(setpoint.stretch, span)] + (
+                    [] if following is None else [Setpoint(setpoint.stretch, math.inf)]),
+                shaper, model.options.short_spell, first=None if placed else first))
+            more, one = _placed(model, begin, outset.check, segment)
+            state = segment.end
+        now = now.along([levels[-1], *more] if levels else more, more[-1].stamp)
+        if one.arrival is not None and not model.material.creeps:
+            # A level of a lagging coil takes effect later, and hardly changes anything.
+            now = now.after(more[-1].flux_density, one.arrival)
+            for number, changed in enumerate(now.changes(more[-1].flux_density, end)):
+                before, model, now = model, changed.model(), changed
+                state = model.held(
+                    _rest(model, one.stretch, more[-1].flux_density, state), before,
+                    more[-1].flux_density)
+                more.append(_held(model, now.time or 0, one.stretch, state))
+                if number % _CHECKED == _CHECKED - 1:
+                    outset.check()
+        levels += more
+        placed.append(one)
+        begin, setpoint = int(end) if following is not None else begin, following
+    return Draft(outset.begin, tuple(levels), tuple(placed))
+
+
+def _held(model: JointModel, time: int, stretch: float, state: State) -> PlannedLevel:
+    """Return the level that holds a stretch from a time in ns on, set in a state."""
+    load = model.holding(stretch)
+    model.limits.check(load, stretch, model.units)
+    return PlannedLevel(time, model.flux_density(load), state, model)
+
+
+def _rest(model: JointModel, stretch: float, flux_density: float, state: State) -> State:
+    """Return rest at a stretch under a level in T; ``state`` has the same modes and coil."""
+    load = model.load(flux_density)
+    return State(
+        stretch, 0.0, load, None if state.amplifier is None else load,
+        (stretch, 0.0) * len(model.material.modes.ratios))
 
 
 def _frame(model: JointModel, state: State) -> MoveRequest:

@@ -21,7 +21,8 @@ from hmsa.planning import drafting
 from hmsa.planning.drafting import Check, PathPoint, PlanStart, proceed
 from hmsa.planning.given_levels import check_levels, draft_levels
 from hmsa.planning.running import RunningPlan
-from hmsa.planning.timeline import Draft, JointModel, Options, Timeline
+from hmsa.planning.timeline import Draft, JointModel, Options, PlannedLevel, Timeline
+from hmsa.planning.warmth import Warmth
 
 __all__ = ['Options', 'Planner']
 
@@ -36,8 +37,12 @@ class Planner(RunningPlan):
             self, actuator: ActuatorParameters, options: Options, *,
             stretch: float | None = None) -> None:
         """Start at rest."""
+        base = JointModel(actuator, options)
+        #: The temperature of the block; None if it changes nothing.
+        self.warmth = Warmth.of(base) if actuator.thermal else None
         super().__init__(
-            JointModel(actuator, options), actuator.rest if stretch is None else stretch)
+            base if self.warmth is None else self.warmth.model(base),
+            actuator.rest if stretch is None else stretch)
         #: Returns the estimate of stretch, rate in 1/s and branch states at a time in ns; None to
         #: use the prediction.
         self.believed: Callable[[int], Believed | None] = lambda time: None
@@ -73,8 +78,9 @@ class Planner(RunningPlan):
 
         Raise `BadInputError` if it cannot, or if its position is another quantity.
         """
-        if (options, actuator) == (self.model.options, self.model.actuator):
-            return self.model
+        known = self.model if self.warmth is None else self.warmth.base
+        if (options, actuator) == (known.options, known.actuator):
+            return known
         was, made = self.model.actuator.coordinate.plural, actuator.coordinate.plural
         if was != made:
             raise BadInputError(
@@ -88,10 +94,81 @@ class Planner(RunningPlan):
         return model
 
     def take_model(self, model: JointModel) -> None:
-        """Plan the next requests with a model; the running plan does not change."""
+        """
+        Plan the next requests with a model; the running plan does not change.
+
+        With temperature coefficients, its values hold at its reference, and plans are made for the
+        present temperature.
+        """
+        if not model.actuator.thermal:
+            self.warmth = None
+        elif self.warmth is None or model not in (self.model, self.warmth.base):
+            self.warmth = Warmth.of(model) if self.warmth is None else replace(
+                self.warmth, base=model)
+            model = self.warmth.model(model)
+        else:
+            return
         if model is not self.model:
             self.model = model
             self.revision += 1
+
+    # -- temperature ---------------------------------------------------------------------------
+
+    def take_temperature(self, temperature: float, time: int) -> None:
+        """
+        Plan the next requests for a temperature in degrees Celsius, measured at a time in ns.
+
+        Raise `BadInputError` if the model has no parameters there.
+        """
+        if self.warmth is not None:
+            found = self.warmth.measured(temperature, self._levels_until(time), time)
+            # Drafts under way were made for nearly this temperature, and stay valid.
+            self.model, self.warmth = found.model(self.model), found
+
+    def foreseen(self, time: int) -> Warmth | None:
+        """Return the temperature at a time in ns under the plan; None if it changes nothing."""
+        return None if self.warmth is None else self.warmth.along(self._levels_until(time), time)
+
+    def _levels_until(self, time: int) -> tuple[PlannedLevel, ...]:
+        """Return the levels from the known temperature on until a time in ns."""
+        known = time if self.warmth is None or self.warmth.time is None else self.warmth.time
+        return self.plan.levels[self.plan.place(known):self.plan.place(max(known, time)) + 1]
+
+    def draft_warmed(self, now: int) -> Draft | None:
+        """
+        Draft the plan again for the present temperature, from the next time that it can change.
+
+        That is now where a setpoint is held, else the next setpoint. None if there is none.
+        """
+        begin, plan = self.soonest(now), self.plan
+        place = plan.under_way(begin)
+        held = plan.segments[place] if place >= 0 else None
+        if held is not None and held.arrival is not None and held.arrival <= begin and (
+                held.path is None and held.code is not Code.LEVELS
+                and not self.model.material.creeps):
+            return drafting.draft_warmed(self._outset(begin), place, held)
+        if place + 1 >= len(plan.segments):
+            return None
+        return drafting.draft_warmed(self._outset(plan.segments[place + 1].since), place + 1)
+
+    def restart(self) -> None:
+        """Drop all plans and return to the initial state at rest, as the clock has restarted."""
+        if self.warmth is not None:
+            # It goes on with the present temperature.
+            self.warmth = replace(self.warmth, time=None)
+        super().restart()
+
+    def clock_set(self, by: int) -> None:
+        """Shift the plan by the ns that the clock was set ahead."""
+        super().clock_set(by)
+        if self.warmth is not None and self.warmth.time is not None:
+            self.warmth = replace(self.warmth, time=self.warmth.time + by)
+
+    def take(self, draft: Draft | None, now: int) -> Timeline:
+        """Replace the plan from the start of a draft of this revision on; return the plan."""
+        # Before the levels that have warmed the block are forgotten.
+        self.warmth = self.foreseen(now)
+        return super().take(draft, now)
 
     # -- requests ------------------------------------------------------------------------------
 
@@ -226,6 +303,7 @@ class Planner(RunningPlan):
             self, begin: int, model: JointModel | None = None,
             believed: Believed | None = None) -> PlanStart:
         """Return the start of a draft; ``believed`` is given together with another model."""
+        anew = model is None
         if model is None:
             model, believed = self.model, self.believed(begin + self.delay)
         state = model.taken_from(self._delayed(begin), self.model)
@@ -233,32 +311,28 @@ class Planner(RunningPlan):
             state = replace(
                 state, stretch=believed[0], rate=believed[1] * model.units.time,
                 followed=believed[2] or state.followed)
-        return PlanStart(self.plan, model, begin, state, self._history.stale, self.check)
+        warmth = self.foreseen(begin) if anew else None
+        if warmth is not None and (ahead := warmth.model(model)) is not model:
+            state = ahead.held(
+                ahead.taken_from(state, model), model, self.plan.level(begin).flux_density)
+            model = ahead
+        return PlanStart(self.plan, model, begin, state, self._history.stale, self.check, warmth)
 
     def as_held(self, time: int) -> Believed | None:
         """
         Return the predicted state at a time in ns, in the stretches of the present model.
 
-        The last level may be planned with other parameters. With those of the model it holds
-        another stretch, and a move from the planned one would leave vibration. None if both have
-        the same parameters, or if the model cannot be at that stretch.
+        The last level, or with a temperature the one then, may be planned with other parameters.
+        With those of the model it holds another stretch, and a move from the planned one would
+        leave vibration. None if both have the same parameters.
         """
-        last, model = self.plan.levels[-1], self.model
+        last = self.plan.levels[-1] if self.warmth is None else self.plan.level(time)
+        model = self.model
         if last.model is model or (
                 last.model.actuator == model.actuator and last.model.others == model.others):
             return None
-        state = self.state(time)
-        stretch = state.stretch + float(
-            equilibrium_stretch(model.load(last.flux_density), model.material)
-            - equilibrium_stretch(last.load, last.model.material))
-        if model.material.beyond(stretch):
-            return None
-        count = len(model.material.branches)
-        more = model.holding(stretch) - model.holding(state.stretch)
-        return stretch, state.rate / model.units.time, (
-            *(x + more for x in state.followed[:count]),
-            *(x if i % 2 else x + stretch - state.stretch
-              for i, x in enumerate(state.followed[count:])))
+        state = model.held(self.state(time), last.model, last.flux_density)
+        return state.stretch, state.rate / model.units.time, state.followed
 
     def as_sent(self, time: int) -> bool:
         """Return whether the level at a time in ns belongs to commanded levels or a path."""

@@ -111,6 +111,20 @@ class JointModel:
         """Parameters that can be estimated besides those of the block, by name."""
         return {x: getattr(self.options, x) for x in ESTIMATED}
 
+    def at_temperature(self, temperature: float) -> 'JointModel':
+        """Return the model at a temperature in degrees Celsius, this one without coefficients."""
+        actuator = self.actuator.at_temperature(temperature)
+        if actuator is self.actuator:
+            return self
+        resistance = self.actuator.thermal.factor('coil_resistance', temperature)
+        return JointModel(actuator, replace(
+            self.options, coil_time_constant=self.options.coil_time_constant / resistance))
+
+    @property
+    def temperature(self) -> float:
+        """Temperature in degrees Celsius that the model holds at, if that matters."""
+        return self.actuator.thermal.reference
+
     def ns(self, time: float) -> int:
         """Return a nondimensional time in ns."""
         return round(time * self.units.time * NANOSECONDS)
@@ -170,6 +184,24 @@ class JointModel:
             None if state.amplifier is None else taken(state.amplifier),
             creeping.carried(
                 state, other.material, self.material, self.units.time / other.units.time))
+
+
+    def held(self, taken: State, other: 'JointModel', flux_density: float) -> State:
+        """
+        Return a state taken from another model in the stretches of this one, under a level in T.
+
+        With the parameters of this model, the level holds another stretch. A state beyond the
+        limits of this model does not change.
+        """
+        more = float(law.equilibrium_stretch(self.load(flux_density), self.material.packed)
+                     - law.equilibrium_stretch(other.load(flux_density), other.material.packed))
+        stretch, count = taken.stretch + more, len(self.material.branches)
+        if self.material.beyond(stretch):
+            return taken
+        force = self.holding(stretch) - self.holding(taken.stretch)
+        return replace(taken, stretch=stretch, followed=(
+            *(x + force for x in taken.followed[:count]),
+            *(x if i % 2 else x + more for i, x in enumerate(taken.followed[count:]))))
 
 
 @dataclass(frozen=True, slots=True)
