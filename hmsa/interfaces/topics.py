@@ -165,6 +165,12 @@ DISTURBANCE_FORCE = Topic(
     'An unplanned force on the simulated actuator: from its timestamp on (0: immediately) until '
     'the next message, force.z pulls along the field, in newtons; all other components are 0.',
     subscribers=(PLANT,))
+TEMPERATURE = Topic(
+    'temperature', 'sensor_msgs/msg/Temperature', NEWEST,
+    'The temperature of the block in degrees Celsius, where parameters `thermal.*` say what it '
+    'changes. The plant publishes it if its coil warms the block (`thermal.rise`); otherwise it '
+    'subscribes, and the simulated block takes the published temperature.',
+    publishers=(PLANT,), subscribers=(PLANNER, PLANT))
 JOINT_STATES = Topic(
     'joint_states', 'sensor_msgs/msg/JointState', SAMPLES,
     'Samples of the actuator: position is stretch, velocity stretch rate in 1/s, effort the '

@@ -6,12 +6,15 @@ from dataclasses import dataclass, field
 from hmsa.model.actuators import Actuators, Setup
 from hmsa.model.equations import Array
 from hmsa.model.simulation import too_large
+from hmsa.model.thermal import checked_temperature, HOTTEST
 from hmsa.model.units import NANOSECONDS
 from hmsa_ros.device.protocol import Change, Kind, Sample
 from hmsa_ros.device.sensor import Delay, Sensor, SensorErrors
 from hmsa_ros.device.watchdog import Device, Fallback, GuardedJoint
 from hmsa_ros.timekeeping import clock_set_words
 
+# Change of temperature in K from which the simulated parameters follow: 1e-4 of any of them.
+_WARMER = 0.01
 # Gap of the clock above which time is skipped instead of simulated.
 _LARGEST_GAP_NS = 5 * NANOSECONDS
 
@@ -54,7 +57,14 @@ class SimulatedDevice(Device):
             GuardedJoint(i, x.fallback, self._notices) for i, x in enumerate(joints)]
         self.period = period
         self.next_sample = time
-        self._actuators = Actuators([x.setup for x in joints], time=time)
+        given = [x.setup for x in joints]
+        # Setups at their reference, and temperatures in degrees Celsius, of joints that have both.
+        self._cold = {i: x for i, x in enumerate(given) if x.actuator.thermal}
+        self.temperatures = {i: x.actuator.thermal.ambient for i, x in self._cold.items()}
+        self._warmed = time  # time in ns of these temperatures
+        self._actuators = Actuators([
+            x.at_temperature(self.temperatures[i]) if i in self._cold else x
+            for i, x in enumerate(given)], time=time)
         self._present = time  # newest time of the clock, which the simulation may lag behind
         self._sensor = Sensor([x.errors for x in joints], measurement_delay, seed)
         self._transit: Delay[tuple[int, int, float]] = Delay(command_delay)
@@ -81,6 +91,10 @@ class SimulatedDevice(Device):
     def rate(self) -> Array:
         """True stretch rate of each joint in 1/s."""
         return self._actuators.rate
+
+    def warms(self, joint: int) -> bool:
+        """Return whether the coil of a joint warms it."""
+        return joint in self._cold and self._cold[joint].actuator.thermal.rise > 0.0
 
     @property
     def setups(self) -> tuple[Setup, ...]:
@@ -116,6 +130,30 @@ class SimulatedDevice(Device):
     def push(self, joint: int, stamp: int, force: float) -> None:
         """Apply a force in N along the field to a joint from a timestamp in ns on, 0 for now."""
         self._actuators.force(joint, stamp or self.time, force)
+
+    def set_temperature(self, joint: int, temperature: float) -> None:
+        """
+        Continue with the parameters of a joint at a temperature in degrees Celsius.
+
+        Raise `BadInputError` for an impossible temperature.
+        """
+        if joint in self._cold:
+            self._actuators.set_temperature(
+                joint, self._cold[joint], checked_temperature(temperature))
+            self.temperatures[joint] = temperature
+
+    def _warm(self, time: int) -> None:
+        """Have the coils warm the joints up to a time in ns."""
+        seconds, self._warmed = (time - self._warmed) / NANOSECONDS, max(time, self._warmed)
+        for i, cold in self._cold.items():
+            if not self.warms(i) or seconds <= 0.0:
+                continue
+            warm = cold.actuator.thermal.warmed(
+                self.temperatures[i], float(self.flux_density[i]), seconds)
+            self.temperatures[i] = min(warm, HOTTEST)
+            if abs(self.temperatures[i] - (
+                    self.setups[i].actuator.thermal.reference)) > _WARMER:
+                self._actuators.set_temperature(i, cold, self.temperatures[i])
 
     def _obey(self, joint: int, stamp: int, level: float) -> None:
         self._actuators.setups[joint].check_level(level)
@@ -158,6 +196,8 @@ class SimulatedDevice(Device):
 
     def _integrate(self, time: int) -> None:
         """Advance all joints; those with an excessive load restart."""
+        if self._cold:
+            self._warm(time)
         for i, reached in self._actuators.advance(time):
             self.guards[i].note(
                 Kind.FAILED, f'{too_large(reached, self.level(i))}; the joint starts again from '
@@ -199,6 +239,7 @@ class SimulatedDevice(Device):
         """Shift all times by the ns that the clock was set ahead; the motion continues."""
         self._actuators.clock_set(by)
         self._present += by
+        self._warmed += by
         # Samples lie on a grid of the new time.
         self.next_sample = -(-(self.next_sample + by) // self.period) * self.period
         self._transit.shift(by)
@@ -212,7 +253,7 @@ class SimulatedDevice(Device):
         for guard in self.guards:
             # Time that was not simulated does not count as silence.
             guard.pass_over(now - self.time)
-        self._actuators.time = now
+        self._actuators.time = self._warmed = now
         self.next_sample = -(-now // self.period) * self.period
 
     # -- restart -------------------------------------------------------------------------------

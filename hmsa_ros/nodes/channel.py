@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from time import monotonic_ns
 
 from rclpy.node import Node
-from sensor_msgs.msg import MagneticField, TimeReference
+from sensor_msgs.msg import MagneticField, Temperature, TimeReference
 from std_msgs.msg import Float64
 
 from hmsa.errors import BadInputError
@@ -41,6 +41,17 @@ class JointChannel:
                 for topic, take in (
                     (topics.FLUX_DENSITY_APPLIED, self._on_applied),
                     (topics.FLUX_DENSITY_RECEIVED, self._on_received)))
+
+        self._temperature: object = None
+        self._names = tuple(joints)
+        self.look_at_temperature()
+
+    def look_at_temperature(self) -> None:
+        """Subscribe to the temperature once it matters."""
+        if self._temperature is None and self._joint in self._runtime.temperatures.joints:
+            self._temperature = ros_entities.subscribe(
+                self._node, topics.of_joint(topics.TEMPERATURE, self._joint, self._names),
+                self._on_temperature)
 
     def send(self, command: Send, frame: str) -> None:
         """Publish a command in the frame of the coil."""
@@ -86,6 +97,11 @@ class JointChannel:
 
     def _on_setpoint(self, message: Float64) -> None:
         self._runtime.request(StretchRequest(self._joint, message.data))
+        self._serve()
+
+    def _on_temperature(self, message: Temperature) -> None:
+        self._runtime.temperature(
+            self._joint, conversions.from_time(message.header.stamp), message.temperature)
         self._serve()
 
     def _on_received(self, message: TimeReference) -> None:

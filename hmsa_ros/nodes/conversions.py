@@ -10,7 +10,7 @@ from builtin_interfaces.msg import Duration, Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import numpy as np
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import JointState, MagneticField, TimeReference
+from sensor_msgs.msg import JointState, MagneticField, Temperature, TimeReference
 from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
@@ -50,6 +50,11 @@ def to_command(stamp: int, flux_density: float, frame: str) -> MagneticField:
     message = MagneticField(header=Header(stamp=to_time(stamp), frame_id=frame))
     message.magnetic_field.z = flux_density
     return message
+
+
+def to_temperature(stamp: int, celsius: float) -> Temperature:
+    """Return the temperature of a block in degrees Celsius at a time in ns."""
+    return Temperature(header=Header(stamp=to_time(stamp)), temperature=celsius)
 
 
 def from_command(message: MagneticField) -> tuple[int, float]:

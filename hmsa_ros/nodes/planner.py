@@ -399,6 +399,8 @@ class PlannerNode(ManagedNode):
         settings, models = settings_from(changed), models_from(changed, self._runtime.group)
         self._settings = changed
         self._runtime.change(settings, models, simultaneous=changed['simultaneous_arrival'])
+        for channel in self._channels.values():
+            channel.look_at_temperature()
 
 
 #: Run by ``hmsa planner`` with the command line's arguments; returns the exit status.

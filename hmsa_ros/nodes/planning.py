@@ -184,6 +184,10 @@ SPECS = (
     ParameterSpec(
         'takeover_max_age', _SETTINGS.takeover_max_age / NANOSECONDS,
         'Maximum age of that sample.', 's', 0.0, 1e6),
+    _changeable(
+        'temperature_max_age', _SETTINGS.temperature_max_age / NANOSECONDS,
+        'Age of the newest temperature from which status and log name it; plans continue from '
+        'it.', 's', 0.0, 1e6),
     AUTOSTART,
 )
 
@@ -240,7 +244,8 @@ def settings_from(values: JointParameters) -> Settings:
             f'parameter feedback is {values["feedback"]} and {modal[0]} has modes.*: expected '
             'observe or off, since feedback does not support secondary modes')
     times: dict[str, Any] = {x: _nanoseconds(values[x]) for x in (
-        'heartbeat_period', 'lateness_tolerance', 'takeover_timeout', 'takeover_max_age')}
+        'heartbeat_period', 'lateness_tolerance', 'takeover_timeout', 'takeover_max_age',
+        'temperature_max_age')}
     return Settings(
         **plain, **times,
         feedback_parameters=_free(values),

@@ -1,6 +1,6 @@
 """Plant node: simulated actuators, driven by timestamped flux density commands."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 import math
 from time import monotonic_ns
@@ -8,6 +8,8 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import WrenchStamped
+from rclpy.publisher import Publisher
+from sensor_msgs.msg import Temperature
 
 from hmsa.errors import BadInputError
 from hmsa.interfaces import parameters as shared
@@ -64,8 +66,12 @@ OWN = (
 )
 
 
+# Interval in ns, in simulated time, of the temperature.
+_TEMPERATURE_NS = 200_000_000
+
+
 class PlantJoint(DeviceJoint):
-    """A simulated actuator, which forces may disturb."""
+    """A simulated actuator, which forces may disturb, and its coil or a heater warm."""
 
     _device: SimulatedDevice
 
@@ -73,6 +79,30 @@ class PlantJoint(DeviceJoint):
         super().__init__(node, number)
         ros_entities.subscribe(node, topics.of_joint(
             topics.DISTURBANCE_FORCE, self.name, node.values.names), self._on_force)
+        topic = topics.of_joint(topics.TEMPERATURE, self.name, node.values.names)
+        self._temperature: Publisher | None = None
+        self._warmed = -_TEMPERATURE_NS
+        if self._device.warms(number):
+            self._temperature = ros_entities.publisher(node, topic)
+        elif number in self._device.temperatures:
+            ros_entities.subscribe(node, topic, self._on_temperature)
+
+    def publish_temperature(self) -> None:
+        """Publish the temperature of a block that its coil warms, if that is due."""
+        time = self._device.time
+        if self._temperature is not None and abs(time - self._warmed) >= _TEMPERATURE_NS:
+            self._warmed = time
+            self._temperature.publish(conversions.to_temperature(
+                time, self._device.temperatures[self._number]))
+
+    def _on_temperature(self, message: Temperature) -> None:
+        if not self._node.active:
+            return
+        try:
+            self._device.set_temperature(self._number, message.temperature)
+        except BadInputError as error:
+            self._node.get_logger().error(
+                f'{self._of_me}temperature ignored: {error}', throttle_duration_sec=1.0)
 
     def _on_force(self, message: WrenchStamped) -> None:
         if not self._node.active:
@@ -161,6 +191,8 @@ _PAUSED_CLOCK_NS = 100_000_000
 
 class PlantNode(DeviceNode):
     """Advance a `SimulatedDevice` along a clock, and publish its samples and changes."""
+
+    _joints: Sequence[PlantJoint] = ()
 
     def __init__(self) -> None:
         super().__init__(topics.PLANT)
@@ -294,6 +326,12 @@ class PlantNode(DeviceNode):
         self._publish_clock(monotonic_ns())
 
     # -- other publications --------------------------------------------------------------------
+
+    def _publish_news(self) -> None:
+        if self.device.temperatures:
+            for joint in self._joints:
+                joint.publish_temperature()
+        super()._publish_news()
 
     def _states(self) -> tuple[int, list[MarkerState]]:
         """Return time and state of the joints, for viewers."""

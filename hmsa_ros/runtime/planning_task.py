@@ -39,7 +39,9 @@ class PlanningTask:
     #: Reads the request, before anything else.
     read: Callable[[Check], None] | None = None
     number: int = field(default_factory=count().__next__)  # increases with each work
-    corrects: bool = False  # whether it is a correction from samples
+    corrects: bool = False  # whether it is a correction from samples or a temperature
+    #: Adopts the drafts of a correction in place of feedback, for a time in ns.
+    take: Callable[[Drafts, int], None] | None = None
     spent: int = 0  # time spent on a correction, in ns
     job: Job | None = None  # what the worker does
     complete: Callable[[Drafts], Drafts] = dict

@@ -37,6 +37,7 @@ class Settings:
     lateness_tolerance: int = 5000  # largest lateness without a new plan
     takeover_timeout: int = NANOSECONDS // 2  # initial wait for plant and sample; 0: no wait
     takeover_max_age: int = NANOSECONDS // 2  # maximum age of such a sample
+    temperature_max_age: int = 10 * NANOSECONDS  # age of a temperature from which it is old
     after_cut_off: str = 'wait'  # one of `AFTER_CUT_OFF`
     max_points: int = 100_000  # maximum number of setpoints in a request, summed over joints
     trajectory_mode: str = 'rest'  # one of `TRAJECTORY_MODES`
@@ -54,7 +55,7 @@ class Settings:
 
     def __post_init__(self) -> None:
         for name in ('heartbeat_period', 'lateness_tolerance', 'takeover_timeout',
-                     'takeover_max_age', 'max_points'):
+                     'takeover_max_age', 'temperature_max_age', 'max_points'):
             if getattr(self, name) < 0:
                 raise BadInputError(f'{name} is {getattr(self, name)}: expected at least 0')
 

@@ -30,6 +30,7 @@ from hmsa_ros.runtime.records import (
     Verdict,
 )
 from hmsa_ros.runtime.reporting import Reporting
+from hmsa_ros.runtime.temperatures import Temperatures
 from hmsa_ros.runtime.worker import Inline
 
 #: Duration in ns that the loop waits for drafts before it serves commands and requests.
@@ -58,12 +59,14 @@ class RequestQueue:
 
     def __init__(
             self, group: PlannerGroup, following: Deviations, follower: Follower,
-            reporting: Reporting, environment: Environment, send: Callable[[int], None],
-            stopping: Callable[[str], None]) -> None:
+            temperatures: Temperatures, reporting: Reporting, environment: Environment,
+            send: Callable[[int], None], stopping: Callable[[str], None]) -> None:
         """Begin without requests; ``stopping`` is called with the name of an adopted stop."""
         self._group, self._following, self._reporting = group, following, reporting
         #: Follows the joints; feedback may take its place.
         self.follower = follower
+        #: Temperatures of the joints, for which plans are made.
+        self.temperatures = temperatures
         self._around, self._send, self._stopping = environment, send, stopping
         self._queue: deque[PlanningTask] = deque()
         # Parts of replaced plans: freeing all at once takes tens of ms.
@@ -135,6 +138,7 @@ class RequestQueue:
                 self._queue.appendleft(self._following.resumption(name))
         if not self._queue:
             self._queue += self.follower.due(self._around.clock())
+            self._queue += self.temperatures.due(self._around.clock())
         del self._leftovers[-_FREED:]
         end = self._around.steady() + SLICE
         while self._queue and (left := end - self._around.steady()) > 0:
@@ -243,6 +247,8 @@ class RequestQueue:
                 'has acknowledged it')
         if severity is Severity.OK and not plans:
             code, words = Code.UNCHANGED, 'already on the way there: the plan is unchanged'
+        if why := self.temperatures.words():
+            words = f'{words}; {why}'
         self._reporting.give(
             Verdict(severity, code, words, request.name), log=severity is not Severity.OK)
 
@@ -258,6 +264,10 @@ class RequestQueue:
 
     def _go_on(self, work: PlanningTask, drafts: Mapping[str, Draft], now: int) -> None:
         """Adopt a plan that was replanned, or corrected from samples."""
+        if work.take is not None:
+            work.take(drafts, now)
+            self._send(self._around.clock())
+            return
         by = self.follower if work.corrects else self._following
         verdict = by.take(work, drafts, now)
         self._send(self._around.clock())

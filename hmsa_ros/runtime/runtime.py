@@ -40,6 +40,7 @@ from hmsa_ros.runtime.request_queue import RequestQueue, SLICE
 from hmsa_ros.runtime.sample_timeout import SampleTimeout
 from hmsa_ros.runtime.stops import Stops
 from hmsa_ros.runtime.takeover import Takeover
+from hmsa_ros.runtime.temperatures import Temperatures
 from hmsa_ros.runtime.throttle import Throttle
 from hmsa_ros.timekeeping import clock_set_words
 
@@ -95,9 +96,10 @@ class Runtime:
             group, self.devices, self.following.newest, self._watch, around, around.unheard,
             lambda: self.settings.tolerances)
         self.devices.stops = lambda: self._stops.judges
+        self.temperatures = Temperatures(group, lambda: self.settings, clock, self._note)
         self.planning = RequestQueue(
-            group, self.following, self.follower, self._reporting, around, self.devices.send,
-            self._stops.begin)
+            group, self.following, self.follower, self.temperatures, self._reporting, around,
+            self.devices.send, self._stops.begin)
         self._follow()
         self._next_beat = 0  # time in ns of the next heartbeat
         # Time by the steady clock, in ns, by which the caller serves this again; None for any.
@@ -296,6 +298,11 @@ class Runtime:
         self._watch.add(joint, stamp, stretch)
         self.follower.observed(joint, stamp, stretch, flux_density, came)
 
+    def temperature(self, joint: str, stamp: int, celsius: float) -> None:
+        """Process the temperature of a joint in degrees Celsius, of a time in ns; 0 for now."""
+        self._process_clock()
+        self.temperatures.measured(joint, stamp, celsius)
+
     def clock_set(self, by: int) -> None:
         """Record that the clock was set ahead by some ns; plans continue."""
         self.clock_jumps += 1
@@ -323,6 +330,7 @@ class Runtime:
         self.follower.restart()
         self.devices.receipts.clock_set()
         self._silence.restart()
+        self.temperatures.restart()
         if back:
             self.group.restart()
             self._watch.restart()
@@ -582,6 +590,8 @@ class Runtime:
         """Return the state of the commands: severity, message and counters."""
         late, severity, message = self.following.lateness, Severity.OK, 'commands sent in time'
         receipts, clocks = self.devices.receipts, self.devices.clocks
+        if cold := self.temperatures.look():
+            severity, message = Severity.WARN, cold
         if late.count:
             severity = Severity.WARN if late.harms or self.following.clocks else Severity.OK
             message = f'{late.count} commands late: {self.following.advice}'
@@ -604,4 +614,5 @@ class Runtime:
             'sent': self.devices.sent, 'late': late.count, 'replanned': self.following.replanned,
             'heartbeats': self.devices.heartbeats,
             'largest_lateness_ms': f'{late.largest / 1e6:.3f}',
-            'refused': self.planning.refused, 'clock_jumps': self.clock_jumps, **values}
+            'refused': self.planning.refused, 'clock_jumps': self.clock_jumps,
+            **self.temperatures.figures(), **values}
