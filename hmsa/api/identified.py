@@ -1,8 +1,9 @@
 """Identification of an actuator from samples and commands."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
+import math
 import os
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from hmsa.identification.quantities import free_of
 from hmsa.identification.result import Identification
 from hmsa.identification.runs import recording_of
 from hmsa.identification.tables import read_csv
+from hmsa.model.thermal import checked_temperature
 from hmsa.runs.bags import read_run
 from hmsa.table import Table
 
@@ -137,7 +139,8 @@ class Identified:
 def identify(
         samples: Any, commands: Any = None, *, actuator: Actuator | None = None,
         free: Sequence[str] | None = None, known: Mapping[str, float] | None = None,
-        uncertain: Mapping[str, float] | None = None) -> Identified:
+        uncertain: Mapping[str, float] | None = None,
+        temperature: float | None = None) -> Identified:
     """
     Identify the parameters of an actuator from samples of its motion.
 
@@ -158,6 +161,9 @@ def identify(
     known, uncertain : mapping of str to float, optional
         Other known values in SI units, such as ``{'sensor_latency': 2e-3}``, and standard
         deviations of known values.
+    temperature : float, optional
+        Temperature of the actuator in degrees Celsius, at which the values hold; default as
+        recorded, if it was.
 
     Returns
     -------
@@ -200,7 +206,11 @@ def identify(
                 'pairs of time and stretch, or no commands')
         recording, block, theirs = recording_of(
             samples.run, None if actuator is None else block)
-        given, base = {**theirs, **given}, actuator or samples.actuator
+        base = actuator or samples.actuator
+        if math.isfinite(recording.temperature):
+            base = _at(base, recording.temperature)
+            given = dict.fromkeys(given, base.model.options.coil_time_constant)
+        given = {**theirs, **given}
     elif isinstance(samples, Path):
         recording = read_csv(
             samples, None if commands is None else file_of(
@@ -218,6 +228,11 @@ def identify(
         recording = Measurement(
             time - time[0], stretch, times - time[0], levels, options.slew_limit,
             coordinate=block.coordinate)
+    if temperature is not None:
+        celsius = checked_temperature(number(temperature, 'temperature', 'degC'))
+        base, block = _at(base, celsius), block.at_temperature(celsius)
+        given = dict.fromkeys(given, base.model.options.coil_time_constant)
+        recording = replace(recording, temperature=celsius)
     others = {x: y for x, y in {**given, **known}.items() if y or x in known}
     names = [] if free is None else names_of(free, 'free')
     result = find(
@@ -231,3 +246,8 @@ def identify(
     belief = belief_in(text)
     return Identified(result, Actuator.from_parameters(
         belief.settings, belief if result.verdict == 'identified' else None), text)
+
+
+def _at(actuator: Actuator, temperature: float) -> Actuator:
+    """Return an actuator at a temperature; unchanged without coefficients."""
+    return actuator.at_temperature(temperature) if actuator.block.thermal else actuator

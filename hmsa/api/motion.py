@@ -81,9 +81,12 @@ class Motion:
         from hmsa.api.actuator import Actuator
         from hmsa.interfaces.actuator import parameters_of
 
-        coil = {x: self.run.number(f'plant.{x}') or self.run.number(f'planner.{x}')
-                for x in ('slew_limit', 'coil_time_constant')}
-        return Actuator.from_parameters({**parameters_of(self.run.plant), **coil})
+        run = self.run
+        return Actuator.from_parameters({
+            **parameters_of(run.plant),
+            'slew_limit': run.number('plant.slew_limit') or run.number('planner.slew_limit'),
+            'coil_time_constant': run.coil_time_constant('plant') or (
+                run.coil_time_constant('planner'))})
 
     def report(self, path: str | Path | None = None) -> Table:
         """

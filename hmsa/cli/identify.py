@@ -16,7 +16,7 @@ from pathlib import Path
 import sys
 from typing import Any, TYPE_CHECKING
 
-from hmsa.cli.options import add_command, JSON, of_unit, show
+from hmsa.cli.options import add_command, JSON, of_unit, show, temperature_option
 from hmsa.cli.progress import progress
 from hmsa.errors import BadInputError
 from hmsa.files import check_targets, may_be_bag, write_text
@@ -50,6 +50,9 @@ def add_parser(subparsers: Any) -> None:
         ('--known', 'NAME=VALUE[+-STD],...', str,
          'fixed values, such as sensor_latency=2ms or half_length=5mm+-1%%; the intervals include '
          'the effect of a standard deviation', {'default': ''}),
+        temperature_option(
+            'temperature of the actuator in the recording in degrees Celsius (default: as '
+            'recorded); the file holds there (thermal.reference)'),
         ('--joint', 'NAME', str, 'joint to identify, if the bag has several', {'default': ''}),
         ('--profile', 'NAME', str, 'also print the profile likelihood of this parameter',
          {'default': ''}),
@@ -89,6 +92,9 @@ def run(arguments: argparse.Namespace) -> int:
         raise BadInputError(f'{both[0]} is free and known: expected it in --free or in --known')
     with progress('reading') as update:
         recording, belief, given = _read(arguments, belief)
+        if arguments.temperature is not None:
+            recording = replace(recording, temperature=arguments.temperature)
+            belief = belief.at_temperature(arguments.temperature)
         belief = replace(belief, others={**belief.others, **known})
         update('fitting', None)
         found = identify(
@@ -163,6 +169,8 @@ def _read(
                 'driver or sense node converts lengths; expected a CSV of lengths with it')
         given = belief.actuator if arguments.params_file is not None else None
         recording, actuator, known = read_bag(path, joint=arguments.joint, actuator=given)
+        if math.isfinite(recording.temperature):
+            belief = belief.at_temperature(recording.temperature)
         return recording, replace(
             belief, actuator=actuator, others={**known, **belief.others}), True
     from hmsa.identification.tables import read_csv

@@ -7,7 +7,7 @@ planner uses as the prior of its feedback.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 import math
 from pathlib import Path
@@ -21,7 +21,7 @@ from hmsa.files import yaml_text
 from hmsa.identification import quantities
 from hmsa.identification.known import Known, PREFIX
 from hmsa.identification.result import Identification
-from hmsa.interfaces.actuator import actuator_from, parameters_of
+from hmsa.interfaces.actuator import actuator_from, parameters_of, thermal_from
 from hmsa.interfaces.parameters import BLOCK, number_of
 from hmsa.interfaces.topics import PLANNER, PLANT
 from hmsa.model.flows import CONSTANTS, FLOWS
@@ -52,6 +52,14 @@ class Belief:
     others: dict[str, float]  # of coil and sensor
     settings: dict[str, Any]  # all parameters in the file, by dotted name
     known: Known
+
+    def at_temperature(self, temperature: float) -> 'Belief':
+        """Return the values at a temperature in degrees Celsius."""
+        actuator, others = self.actuator.at_temperature(temperature), dict(self.others)
+        if 'coil_time_constant' in others:
+            others['coil_time_constant'] /= self.actuator.thermal.factor(
+                'coil_resistance', temperature)
+        return replace(self, actuator=actuator, others=others)
 
     def number(self, name: str, default: float) -> float:
         """Return a setting that is a number."""
@@ -176,6 +184,8 @@ def file_text(found: Identification, belief: Belief, run: str, now: datetime) ->
         f'# Verdict: {found.verdict}: {found.reason}.',
         *([f'# Accepted: what the model lacks costs {100.0 * found.cost:.2g} % of a step.']
           if found.verdict != 'identified' else []),
+        *([f'# At {found.recording.temperature:.4g} degrees Celsius (thermal.reference).']
+          if math.isfinite(found.recording.temperature) else []),
         f'# Noise {found.noise_std:.3g} of {found.recording.coordinate.name} a sample, '
         f'{found.samples} samples.',
         *(f'# Note: {x}.' for x in found.warnings),
@@ -195,6 +205,14 @@ def file_text(found: Identification, belief: Belief, run: str, now: datetime) ->
                 x for x, (constant, _) in quantities.constants_of(actuator.law).items()
                 if constant.name == key and x in found.names]
             written[key] = _line(key, value, found, *sought)
+    thermal, temperature = (
+        belief.actuator.thermal or thermal_from(belief.settings), found.recording.temperature)
+    known = math.isfinite(temperature)
+    if known:
+        thermal = thermal.at(temperature)
+    for key, value in (thermal.parameters or (
+            {'thermal.reference': temperature} if known else {})).items():
+        written[key] = _line(key, value, found)
     for name in _OTHERS:
         if name in found.names or name in belief.others:
             written[name] = _line(name, found.values[name], found, name)

@@ -53,6 +53,8 @@ class Measurement:
         Information for the reader, one sentence each.
     coordinate : Coordinate
         Kind of position that the samples measure.
+    temperature : float
+        Temperature of the actuator in degrees Celsius; NaN if it was not measured.
     at_rest : bool
         Whether the motion begins at rest, as determined by `identify`.
 
@@ -74,6 +76,7 @@ class Measurement:
     notes: tuple[str, ...] = ()
     coordinate: Coordinate = STRETCH
     at_rest: bool = True
+    temperature: float = math.nan
 
     def __post_init__(self) -> None:
         """Check the arrays."""

@@ -7,6 +7,7 @@ import numpy as np
 
 from hmsa.errors import BadInputError
 from hmsa.identification.measurement import Measurement
+from hmsa.interfaces.topics import PLANNER
 from hmsa.model.parameters import ActuatorParameters
 from hmsa.model.units import NANOSECONDS
 from hmsa.runs.bags import read_run
@@ -31,7 +32,8 @@ def recording_of(
         run: Run, actuator: ActuatorParameters | None = None
 ) -> tuple[Measurement, ActuatorParameters, dict[str, float]]:
     """Return the recording of a run, as `read_bag`; raise `BadInputError` if it has no level."""
-    block = actuator or run.planner
+    block = run.planner if actuator is None else actuator if math.isnan(run.temperature) else (
+        actuator.at_temperature(run.temperature))
     # A recorder receives earlier latched changes after the first new one.
     levels = run.reported or in_force((x,) for x in without_repeats(run.accepted)[0])
     if not levels:
@@ -57,6 +59,7 @@ def recording_of(
     return (
         Measurement(
             (run.time - zero) / NANOSECONDS, run.stretch, stamps[keep], fields[keep],
-            slew or math.inf, 0.0, run.label, notes, block.coordinate),
+            slew or math.inf, 0.0, run.label, notes, block.coordinate,
+            temperature=run.temperature),
         block,
-        {'coil_time_constant': run.number('planner.coil_time_constant')})
+        {'coil_time_constant': run.coil_time_constant(PLANNER)})

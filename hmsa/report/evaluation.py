@@ -243,7 +243,7 @@ def _delivery(run: Run, actuator: ActuatorParameters, node: str) -> Delivery:
     unit = actuator.time_unit
     return Delivery(
         slew=run.number(f'{node}.slew_limit') / actuator.flux_density_unit * unit or math.inf,
-        lag=run.number(f'{node}.coil_time_constant') / unit)
+        lag=run.coil_time_constant(node) / unit)
 
 
 def _measure(

@@ -21,6 +21,7 @@ from hmsa.errors import assume, BadInputError, BagError, MissingWarning
 from hmsa.interfaces.outcome import newest, Outcome
 from hmsa.judge.records import SensorModel
 from hmsa.model.schedule import is_axial_field
+from hmsa.model.thermal import COLDEST, HOTTEST
 from hmsa.model.units import NANOSECONDS
 from hmsa.runs import topics as roles
 from hmsa.runs.levels import RecordedLevel
@@ -193,6 +194,7 @@ class _Collected:
         self.commands: defaultdict[str, list[RecordedLevel]] = defaultdict(list)
         self.applied: defaultdict[str, list[RecordedLevel]] = defaultdict(list)
         self.forces: defaultdict[str, list[tuple[int, int, float]]] = defaultdict(list)
+        self.temperatures: defaultdict[str, list[tuple[int, int, float]]] = defaultdict(list)
         self.refused = Counter[str]()
         # Of all joints, with the time of publishing by the planner's clock: all are latched, and
         # a new subscriber receives old ones, perhaps after newer ones.
@@ -236,6 +238,13 @@ class _Collected:
             self.forces[joint].append((
                 sent, nanoseconds_of(content.header.stamp) or sent,
                 float(content.wrench.force.z)))
+        elif role == roles.TEMPERATURE:
+            if COLDEST <= content.temperature <= HOTTEST:
+                self.temperatures[joint].append((
+                    sent, nanoseconds_of(content.header.stamp) or sent,
+                    float(content.temperature)))
+            else:
+                self.left_out += 1
         elif role == roles.PLAN:
             self.plans.append((message.publish_time, _SentPlan.of(sent, content)))
         elif role == roles.OUTCOMES:
@@ -299,6 +308,10 @@ class _Collected:
         samples, sample_notes, lost_samples = self.samples.columns(
             f'{reader.path}: {states}', named, required=bool(joint))
         plant, planner, known, more = actuators(parameters, given, named)
+        if warm := self.temperatures[key]:
+            # The parameters are those at the temperature of the run.
+            mean = sum(x for _, _, x in warm) / len(warm)
+            plant, planner = plant.at_temperature(mean), planner.at_temperature(mean)
         refused = self.refused[key]
         notes = [*self.notes, *summary.problems]
         if roles.COMMAND not in topics:
@@ -318,7 +331,8 @@ class _Collected:
         run = Run(
             label, named, reader.path, **samples, commands=tuple(self.commands[key]),
             applied=_begun(self.applied[key], int(samples['time'][0])),
-            forces=tuple(self.forces[key]), plans=tuple(self._plans(joint)),
+            forces=tuple(self.forces[key]), temperatures=tuple(warm),
+            plans=tuple(self._plans(joint)),
             verdicts=tuple(x for _, x in self.verdicts), outcomes=outcomes, sensors=tuple(
                 x for of, x in self.sensors
                 if of == joint or len({y for y, _ in self.sensors}) == 1),

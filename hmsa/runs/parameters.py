@@ -72,7 +72,7 @@ def actuators(
             try:
                 found[node] = actuator_from(
                     {k: v for k, v in values.items() if v is not None}
-                    | _own(parameters, joint, node, shared.LAW))
+                    | _own(parameters, joint, node, (*shared.LAW, *shared.THERMAL)))
             except BadInputError as error:
                 notes.append(f'The parameters of the {node} in the bag cannot be used: {error}.')
     if given:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from hmsa.errors import BadInputError
 from hmsa.interfaces.outcome import Outcome
 from hmsa.interfaces.parameters import LATENESS_LIMIT, number_of
+from hmsa.interfaces.topics import PLANT
 from hmsa.judge.records import SensorModel
 from hmsa.model.equations import Array
 from hmsa.model.parameters import ActuatorParameters, paper_actuator
@@ -69,6 +70,8 @@ class Run:
     commands: tuple[RecordedLevel, ...] = ()
     applied: tuple[RecordedLevel, ...] = ()  # changes of the field that took effect, as reported
     forces: tuple[tuple[int, int, float], ...] = ()  # recording time, timestamp (ns), newtons
+    # Recording time, timestamp (ns), and temperature in degrees Celsius
+    temperatures: tuple[tuple[int, int, float], ...] = ()
     plans: tuple[tuple[RecordedLevel, ...], ...] = ()
     verdicts: tuple[RecordedVerdict, ...] = ()  # each once
     # Of setpoints, by begin; of a simulated run as planned, without findings
@@ -109,6 +112,22 @@ class Run:
         """Return a number like ``'planner.slew_limit'``; 0 if unknown, negative or not finite."""
         value = number_of(of_joint(self.parameters, self.joint, name))
         return value if value is not None and 0.0 <= value < math.inf else 0.0
+
+    @property
+    def temperature(self) -> float:
+        """Mean of the recorded temperatures in degrees Celsius; NaN if there are none."""
+        values = [x for _, _, x in self.temperatures]
+        return sum(values) / len(values) if values else math.nan
+
+    def coil_time_constant(self, node: str) -> float:
+        """Return the time constant in s that a node has for the coil, at the temperature."""
+        own = self.plant if node == PLANT else self.planner
+        value = self.number(f'{node}.coil_time_constant')
+        if not (value and own.thermal.coil_resistance):
+            return value
+        given = number_of(of_joint(self.parameters, self.joint, f'{node}.thermal.reference'))
+        # The values of the actuator hold at the temperature of the run.
+        return value * (1.0 if given is None else own.thermal.factor('coil_resistance', given))
 
     @property
     def one_clock(self) -> bool:

@@ -15,10 +15,11 @@ TYPES = {
     declared.from_outside(x.name, declared.PLANNER): x.type for x in (
         declared.JOINT_STATES, declared.FLUX_DENSITY_COMMAND, declared.FLUX_DENSITY_APPLIED,
         declared.DISTURBANCE_FORCE, declared.PLAN, declared.STATUS, declared.OUTCOMES,
-        declared.ESTIMATE)}
-JOINT_STATES, COMMAND, APPLIED, FORCE, PLAN, STATUS, OUTCOMES, ESTIMATE = TYPES
+        declared.ESTIMATE, declared.TEMPERATURE)}
+(JOINT_STATES, COMMAND, APPLIED, FORCE, PLAN, STATUS, OUTCOMES, ESTIMATE,
+ TEMPERATURE) = TYPES
 # Roles with a topic for each joint if there are several.
-_OF_A_JOINT = (COMMAND, APPLIED, FORCE)
+_OF_A_JOINT = (COMMAND, APPLIED, FORCE, TEMPERATURE)
 _TRAJECTORY = declared.from_outside(declared.JOINT_TRAJECTORY.name, declared.PLANNER)
 
 

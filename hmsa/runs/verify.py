@@ -3,9 +3,9 @@ Check of a run against the model: its commands, simulated again.
 
 The simulation starts from the state of the first sample and must reproduce all later samples of
 the stretch. If the plant reported which levels took effect and when, these are used, so that late,
-refused and repeated commands and the watchdog are accounted for. Recorded disturbing forces are
-applied, and viscoelastic branches are simulated. Measurement noise is not: it remains as a
-difference.
+refused and repeated commands and the watchdog are accounted for. Recorded disturbing forces and
+temperatures are applied, and viscoelastic branches are simulated. Measurement noise is not: it
+remains as a difference.
 """
 
 from collections.abc import Iterator
@@ -21,6 +21,7 @@ import numpy as np
 
 from hmsa.errors import BadInputError
 from hmsa.interfaces.parameters import number_of
+from hmsa.interfaces.topics import PLANT
 from hmsa.model.creep import Creep
 from hmsa.model.equations import Array
 from hmsa.model.units import NANOSECONDS
@@ -43,7 +44,7 @@ if TYPE_CHECKING:
 
 # Distance in time from other samples, in ns, above which samples belong to another run.
 _LARGEST_LEAP = 3600 * NANOSECONDS
-_COMMAND, _FORCE, _SAMPLE = range(3)
+_COMMAND, _FORCE, _TEMPERATURE, _SAMPLE = range(4)
 # Minimum distance from rest, in stretch, for branches to have an overstress.
 _AT_REST = 1e-6
 
@@ -113,12 +114,13 @@ def verify_run(run: Run) -> Verification:
         np.maximum.accumulate(run.logged[window]).tolist(), itertools.repeat(_SAMPLE),
         run.time[window].tolist(), run.stretch[window].tolist(), strict=False)
     forces = ((sent, _FORCE, stamp, newton) for sent, stamp, newton in run.forces)
+    warm = ((sent, _TEMPERATURE, stamp, celsius) for sent, stamp, celsius in run.temperatures)
     count = window.stop - window.start
     late = refused = 0
     left_out = run.left_out + len(run.time) - count
     largest, where = 0.0, 0
     for _, kind, stamp, value in heapq.merge(
-            samples, _commands(run, window.start), forces, key=lambda x: x[:2]):
+            samples, _commands(run, window.start), forces, warm, key=lambda x: x[:2]):
         if kind == _SAMPLE:
             simulation.advance(stamp)
             difference = abs(simulation.stretch - value)
@@ -126,7 +128,9 @@ def verify_run(run: Run) -> Verification:
                 largest, where = difference, stamp - begin
             continue
         try:
-            if kind == _FORCE:
+            if kind == _TEMPERATURE:
+                simulation.set_temperature(value)
+            elif kind == _FORCE:
                 simulation.force(stamp, value)
             elif simulation.command(stamp, value) > 0 and not run.applied:
                 late += 1
@@ -178,8 +182,10 @@ def _start(run: Run, first: int, creep: Creep) -> 'ActuatorSimulation':
     stamp = int(run.time[first])
     simulation = ActuatorSimulation(
         run.plant, time=stamp, slew_limit=run.number('plant.slew_limit') or math.inf,
-        coil_time_constant=run.number('plant.coil_time_constant'),
+        coil_time_constant=run.coil_time_constant(PLANT),
         creep=creep)
+    if run.temperatures:
+        simulation.set_temperature(run.temperatures[0][2])
     # Levels applied by then count; the field of a slow coil may not have settled yet.
     past = [x.flux_density for x in sorted(run.applied, key=lambda x: x.stamp)
             if x.stamp <= stamp]
