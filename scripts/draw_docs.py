@@ -52,6 +52,7 @@ from hmsa_ros.clients.adapting import second_act  # noqa: E402
 from hmsa_ros.clients.demo import SEQUENCE  # noqa: E402
 from hmsa_studies.__main__ import PICTURES as STUDIES  # noqa: E402
 from hmsa_studies.paper import draw_figure, FIGURES  # noqa: E402
+from hmsa_studies.warming import SILICONE  # noqa: E402
 
 FOLDER = ROOT / 'docs' / 'images'
 STRETCH, TIME = style.axis('stretch', r'\lambda'), style.axis('time', r'\tau')
@@ -231,6 +232,40 @@ def entanglements(path: Path) -> None:
         style.finish(right, share, style.axis('vibration', unit='% of step'), 'c')
 
 
+def temperature(path: Path) -> None:
+    """Draw the command of a move by temperature, and what that of 25 degrees leaves there."""
+    cold = replace(paper_actuator(MATERIAL), thermal=SILICONE)
+    time = np.linspace(0.0, 60.0, 12001)
+    known = plan_two_step(1.0, 1.4, cold.nondimensional)
+    temperatures, found = np.linspace(5.0, 65.0, 25), []
+    for celsius in temperatures:
+        hot = cold.at_temperature(float(celsius))
+        plan = plan_two_step(1.0, 1.4, hot.nondimensional)
+        load, faster = (getattr(cold, x) / getattr(hot, x) for x in (
+            'flux_density_unit', 'time_unit'))
+        switch = known.tau_p * faster
+        stretch, _ = simulate(
+            [0.0, switch], [load * known.beta_p, load * known.beta_1], time, hot.nondimensional)
+        found.append((
+            1e3 * hot.units.level(plan.beta_p), 1e3 * hot.units.level(plan.beta_1),
+            1e3 * plan.tau_p * hot.time_unit, 250.0 * np.ptp(stretch[time > switch][:800]),
+            250.0 * (stretch[-1] - 1.4)))
+    first, last, tau, rings, offset = np.transpose(found)
+    with style.picture(path, 2.9, SCREEN) as figure:
+        left, middle, right = figure.subplots(1, 3)
+        for axes, rows in (
+                (left, {'$B_p$': first, '$B_1$': last}), (middle, {'': tau}),
+                (right, {'vibration': rings, 'offset': offset})):
+            for (name, values), look in zip(rows.items(), looks.CASES, strict=False):
+                axes.plot(temperatures, values, **look.line(label=name))
+        left.legend(loc='upper left')
+        right.legend(loc='lower left')
+        degrees = style.axis('temperature', 'T', '°C')
+        style.finish(left, degrees, style.axis('flux density', unit='mT'), 'a')
+        style.finish(middle, degrees, style.axis('time', 't_p', 'ms'), 'b')
+        style.finish(right, degrees, style.axis('error', unit='% of step'), 'c')
+
+
 def creep(path: Path) -> None:
     """Draw a creeping block commanded by the paper's two-step and by a plan that knows it."""
     creeping = replace(MATERIAL, creep=Creep((0.1, 0.1), (2.0, 20.0)))
@@ -404,8 +439,8 @@ PICTURES: dict[str, Callable[[Path], None]] = {
     'demo': demo, 'adapting': adapting, 'moves': moves, 'figure_05': figure(5),
     'figure_08': figure(8), 'theory_force': force, 'theory_two_steps': two_steps,
     'theory_paths': energy, 'theory_deliveries': deliveries, 'theory_smooth': smooth,
-    'laws': laws, 'entanglements': entanglements, 'creep': creep, 'beam': beam,
-    **STUDIES}
+    'laws': laws, 'entanglements': entanglements, 'temperature': temperature, 'creep': creep,
+    'beam': beam, **STUDIES}
 #: What draws each animation.
 ANIMATIONS: dict[str, Callable[[Path], None]] = {'moving': moving}
 
