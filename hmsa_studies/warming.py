@@ -67,7 +67,14 @@ def block() -> ActuatorParameters:
 
 def warming(way: str, seed: int = 0) -> list[Left]:
     """
-    Run the moves; ``way`` is one of `WAYS`.
+    Run the moves.
+
+    Parameters
+    ----------
+    way : str
+        What the planner knows, one of `WAYS`.
+    seed : int
+        Seed of the noise, for feedback.
 
     Returns
     -------

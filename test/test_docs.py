@@ -224,7 +224,7 @@ def test_topics_and_services_are_those_that_the_nodes_have(start, ros, ros_env):
     from hmsa.interfaces import topics
 
     # By parameter only, or only while it is needed.
-    sometimes = {'/clock', '/planner/markers', '/plant/markers'}
+    sometimes = {'/clock', '/planner/markers', '/plant/markers', '/temperature'}
     declared = [x for x in vars(topics).values() if isinstance(x, topics.Topic)]
     services = [x for x in vars(topics).values() if isinstance(x, topics.Service)]
 

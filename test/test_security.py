@@ -34,6 +34,10 @@ COMMAND = '/flux_density_command'
 # Where control_msgs is installed.
 FOLLOW = {('execute', '/planner/follow_joint_trajectory'),
           ('publish', '/planner/controller_state')}
+# Of a plant whose coil warms the block; others subscribe.
+WARMS = {('publish', '/temperature')}
+# So that the temperature matters.
+WARM = ('-p', 'thermal.remanence:=-0.001')
 RUNNING = ('planner', 'plant', 'recorder')
 # Ways into a node that are no requests to move: none but operators may use them.
 PARAMETERS = ('set_parameters', 'set_parameters_atomically', 'change_state')
@@ -126,7 +130,7 @@ def watch(
 
 def enclave_of(node: str) -> set[Grant]:
     """Return the permissions of a node of this package."""
-    return GRANTS[f'/hmsa/{node}'] - FOLLOW
+    return GRANTS[f'/hmsa/{node}'] - FOLLOW - (WARMS if node == 'plant' else set())
 
 
 def test_policies_follow_the_schema_and_name_an_enclave_for_every_node_and_person():
@@ -209,12 +213,13 @@ def test_policies_grant_exactly_what_the_nodes_do(tmp_path, start, ros):
     # waits for a sample of it.
     recorder = start.hmsa('recorder', '--ros-args', '-p', f'storage.uri:={bag}', *simulated)
     plant = start.hmsa(
-        'plant', '--ros-args', '-p', 'publish_clock:=true', '-p', 'start_paused:=true')
+        'plant', '--ros-args', '-p', 'publish_clock:=true', '-p', 'start_paused:=true', *WARM)
     planner = start.hmsa(
-        'planner', '--ros-args', *simulated, '-p', 'takeover_timeout:=60.0')
+        'planner', '--ros-args', *simulated, '-p', 'takeover_timeout:=60.0', *WARM)
     # There to be recorded, without a coil.
     driver = start.hmsa('driver', '--ros-args', '-p', 'autostart:=false')
-    force = ros_entities.publisher(ros.node, topics.DISTURBANCE_FORCE)
+    outside = [ros_entities.publisher(ros.node, x) for x in (
+        topics.DISTURBANCE_FORCE, topics.TEMPERATURE)]
     for topic in (topics.JOINT_TRAJECTORY, topics.SETPOINT):
         ros.publisher(topic.type, f'/planner/{topic.name[2:]}', topic.qos, subscribers=2)
     requests = ros.publisher(
@@ -247,12 +252,13 @@ def test_policies_grant_exactly_what_the_nodes_do(tmp_path, start, ros):
     seen['recorder'] |= asked
     for process in (planner, plant, recorder, driver):
         assert process.stop() == 0, process.output
-    ros.node.destroy_publisher(force)
+    for publisher in outside:
+        ros.node.destroy_publisher(publisher)
 
     # A replay: the player leads, the plant follows.
     again = start.hmsa(
         'recorder', '--ros-args', '-p', f'storage.uri:={tmp_path / "again"}', *simulated)
-    plant = start.hmsa('plant', '--ros-args', *simulated)
+    plant = start.hmsa('plant', '--ros-args', *simulated, *WARM)
     player = start.hmsa(
         'player', '--ros-args', '-p', f'storage.uri:={bag}', '-p', 'play.rate:=0.001',
         '-p', 'play.clock_publish_frequency:=100.0',
