@@ -57,16 +57,17 @@ def run(arguments: argparse.Namespace) -> int:
                 x.stretch, x.b_p, x.tau_p, x.b_1, x.arrival * 1e3, 100.0 * x.residual,
                 100.0 * x.residual_unshaped, str(x.finding['verdict']).replace('_', ' '))
                 for x in result.setpoints),
-            'b and tau nondimensional as in the paper; arrival from the start of the move; '
-            'residual: peak-to-peak stretch after arrival, in % of the step; unshaped: simulated '
-            'on the same plant'),
+            'b and tau are nondimensional as in the paper, percentages of the step', legend=(
+                ('arrival', 'time from the start of the move'),
+                ('residual', 'peak-to-peak stretch after arrival'),
+                ('unshaped', 'the same after unshaped steps, simulated on the same plant'))),
         Table((
             Column('feedback'), Column('target'), Column('arrival', 'ms', '.1f'),
             Column('vibration', '%', '.2f'), Column('offset', '%', '+.2f')),
             tuple((x.feedback, x.stretch, x.arrival * 1e3, 100.0 * x.vibration, 100.0 * x.offset)
                   for x in result.adapting),
-            'a larger block, simulated in this process, whose shear modulus is 20 % above that '
-            'planned with; vibration after the arrival and rest beside the target, in % of the '
-            'step'),
+            'a larger block, simulated in this process, whose shear modulus is 20 % higher than '
+            'in the model of the planner; percentages are of the step', legend=(
+                ('vibration', 'peak to peak after arrival'), ('offset', 'mean minus target'))),
         f'bag      {result.bag}', f'picture  {result.picture}', f'         {result.second}')
     return 0 if result.succeeded else 1
