@@ -61,7 +61,8 @@ def test_derivatives_with_modes_are_those_of_finite_differences(slew, extras):
     recording = Measurement(
         times, 1.0 + 0.1 * np.sin(70.0 * times), *levels_of(3), slew_limit=slew)
     actuator = replace(
-        TRUE, transverse_mass_factor=1.3, modes=replace(TRUE.modes, exponents=(0.3, -0.2)))
+        TRUE, transverse_mass_factor=1.3, modes=replace(
+            TRUE.modes, exponents=(0.3, -0.2), share_exponents=(-2.0, 0.7)))
     values = values_of(actuator, extras)
     free = (*DEFAULT_FREE, 'mass_factor', 'transverse_mass_factor', *SECONDARY[0], *SECONDARY[1],
             *extras)
@@ -77,9 +78,11 @@ def test_derivatives_with_modes_are_those_of_finite_differences(slew, extras):
             difference, abs=2e-5 * np.max(np.abs(difference))), name
 
 
-def test_response_with_modes_is_the_motion_of_the_simulation():
-    recording = recorded(noise=0.0, count=3)
-    simulation = ActuatorSimulation(TRUE)
+@pytest.mark.parametrize('exponents', [(), (-2.0, 0.7)])
+def test_response_with_modes_is_the_motion_of_the_simulation(exponents):
+    true = replace(TRUE, modes=replace(TRUE.modes, share_exponents=exponents))
+    recording = recorded(true, noise=0.0, count=3)
+    simulation = ActuatorSimulation(true)
     for time, level in zip(recording.level_times, recording.levels, strict=True):
         simulation.command(round(1e9 * time), float(level))
     stretch = []

@@ -45,6 +45,7 @@ DIMENSIONLESS = {
     'viscoelastic.exponent', 'viscoelastic.stress',
     'actuator.mass_factor', 'actuator.transverse_mass_factor', 'modes.frequency_ratio',
     'modes.share', 'modes.damping_ratio', 'modes.ratio_exponent',
+    'modes.share_exponent',
     # Each number of them has its own unit.
     'identification.values', 'identification.covariance',
     'arrival_tolerance', 'feedback_tolerance', 'stretch_tolerance', 'vibration_tolerance',

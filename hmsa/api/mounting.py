@@ -87,12 +87,13 @@ def mount_facts(actuator: ActuatorParameters) -> list[tuple[str, str]]:
     if not actuator.modes:
         return []
     paper = replace(actuator, mass_factor=1.0, transverse_mass_factor=1.0, modes=Modes())
-    left, tuned = (_left(actuator, x) for x in (paper, replace(actuator, modes=Modes())))
+    left, tuned, modal = (_left(actuator, *x) for x in (
+        (paper,), (replace(actuator, modes=Modes()),), (actuator, 'modal')))
     return [
         ('if it deformed uniformly', f'{1.0 / paper.period:.5g} Hz'),
         ('modes, f/f1 (share)', _modes_text(actuator.modes)),
         ("two_step, paper's model", f'leaves {left:.2g} % of a step to {1.0 + _MOVE:g}'),
-        ('two_step, first mode', f'leaves {tuned:.2g} %; shaper modal, none')]
+        ('two_step, first mode', f'leaves {tuned:.2g} %; shaper modal, {modal:.2g} %')]
 
 
 def _facts_of_beam(beam: ActuatorParameters) -> list[tuple[str, str]]:
@@ -114,14 +115,17 @@ def _facts_of_beam(beam: ActuatorParameters) -> list[tuple[str, str]]:
 
 def _modes_text(modes: Modes) -> str:
     return ', '.join(
-        f'{x:.3g} ({100.0 * y:.2g} %)' for x, y in zip(modes.ratios, modes.shares, strict=True))
+        ('' if i in modes.ringing else 'weak ones ') + f'{x:.3g} ({100.0 * y:.2g} %)'
+        for i, (x, y) in enumerate(zip(modes.ratios, modes.shares, strict=True)))
 
 
-def _left(actual: ActuatorParameters, planned: ActuatorParameters) -> float:
-    """Return the vibration in % of a step after a two-step command, peak to peak."""
+def _left(
+        actual: ActuatorParameters, planned: ActuatorParameters, shaper: str = 'two_step'
+) -> float:
+    """Return the vibration in % of a step after a command, peak to peak."""
     material, rest = actual.nondimensional, actual.rest
     move = _BEND if rest == 0.0 else _MOVE
-    levels = get_shaper('two_step')(MoveRequest(
+    levels = get_shaper(shaper)(MoveRequest(
         State(rest), rest + move, planned.nondimensional)).levels
     faster = planned.time_unit / actual.time_unit
     levels = tuple(replace(x, time=x.time * faster) for x in levels)

@@ -61,7 +61,7 @@ def modal_free(actuator: ActuatorParameters, free: Sequence[str]) -> tuple[str, 
     return (
         *('mass_factor' if x == 'shear_modulus' else x for x in free
           if x not in (quantities.MODES, 'chain_limit')),
-        *(x for names in quantities.SECONDARY[:len(actuator.modes.ratios)] for x in names[:3]))
+        *(x for i in actuator.modes.ringing for x in quantities.SECONDARY[i][:3]))
 
 
 @dataclass(frozen=True)

@@ -349,9 +349,10 @@ class _Fit:
         """Return the actuator with the mass and damping that fit best."""
         actuator = self._sequence.actuator
         modes = actuator.modes
-        if not modes.exponents:
-            actuator = replace(
-                actuator, modes=replace(modes, exponents=(0.0,) * len(modes.ratios)))
+        none = (0.0,) * len(modes.ratios)
+        actuator = replace(actuator, modes=replace(
+            modes, exponents=modes.exponents or none,
+            share_exponents=modes.share_exponents or none))
         tried = [replace(actuator, mass_factor=actuator.mass_factor / x**2)
                  for x in (*_FIRSTS, 1.0)]
         return self._refined(min(tried, key=lambda x: float(np.sum(self._left(x)**2))))
@@ -366,7 +367,8 @@ class _Fit:
                 continue
             more = Modes(
                 (*modes.ratios, float(ratio)), (*modes.shares, _SHARE),
-                (*modes.dampings, _DAMPING), (*modes.exponents, 0.0))
+                (*modes.dampings, _DAMPING), (*modes.exponents, 0.0),
+                (*modes.share_exponents, 0.0))
             change = self._shown(replace(self.found, modes=more)) - base
             size = -float(change @ left) / max(float(change @ change), 1e-300)
             share = min(max(size * _SHARE, -0.5 * _MOST_SHARE), 0.5 * _MOST_SHARE)

@@ -87,7 +87,8 @@ QUANTITIES: dict[str, Quantity] = {
            ('frequency_ratio', 2.0, 'log', 1.05, 100.0),
            ('share', 0.0, 'linear', -0.9, 0.9),
            ('damping_ratio', 0.05, 'linear', 0.0, 0.95),
-           ('ratio_exponent', 0.0, 'linear', -5.0, 5.0))},
+           ('ratio_exponent', 0.0, 'linear', -5.0, 5.0),
+           ('share_exponent', 0.0, 'linear', -10.0, 10.0))},
     **dict.fromkeys(GEOMETRY, Quantity('m')),
 }
 #: Ratio and time of each viscoelastic branch.
@@ -96,9 +97,9 @@ BRANCHES = tuple((f'viscoelastic_ratio{x}', f'viscoelastic_time{x}') for x in _N
 FLOWING = tuple(tuple(f'viscoelastic_{y}{x}' for y in CONSTANTS) for x in _NUMBERS)
 #: Name that frees secondary modes, as many as the recording shows, and the mass factor.
 MODES = 'modes'
-#: Ratio, share, damping ratio and exponent of each secondary mode.
+#: Ratio, share, damping ratio and exponents of each secondary mode.
 SECONDARY = tuple(tuple(f'modes.{y}{x}' for y in (
-    'frequency_ratio', 'share', 'damping_ratio', 'ratio_exponent'))
+    'frequency_ratio', 'share', 'damping_ratio', 'ratio_exponent', 'share_exponent'))
     for x in _MODE_NUMBERS)
 #: Factors on the mass.
 FACTORS = ('mass_factor', 'transverse_mass_factor')

@@ -59,7 +59,7 @@ def actuator_from(
             numbers['shear_modulus'] = modulus
     continuum = {x.name: values.get(x.name, x.default) for x in MODES}
     modes = Modes(*(tuple(continuum.pop(f'modes.{x}')) for x in (
-        'frequency_ratio', 'share', 'damping_ratio', 'ratio_exponent')))
+        'frequency_ratio', 'share', 'damping_ratio', 'ratio_exponent', 'share_exponent')))
     return ActuatorParameters(
         law=elastic, modes=modes, thermal=thermal_from(values),
         **{name.removeprefix('actuator.'): value for name, value in continuum.items()},

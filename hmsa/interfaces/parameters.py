@@ -251,6 +251,10 @@ MODES = (
         'modes.ratio_exponent', [],
         'Modes: exponent of the stretch at rest with which each frequency ratio grows; empty for '
         'constant ratios.', '', -5.0, 5.0, items=float),
+    ParameterSpec(
+        'modes.share_exponent', [],
+        'Modes: exponent of the stretch with which each share grows relative to that of the first '
+        'mode; empty for constant shares.', '', -10.0, 10.0, items=float),
 )
 
 _coefficient = partial(ParameterSpec, default=0.0, unit='1/K', minimum=-0.1, maximum=0.1)

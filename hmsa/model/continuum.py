@@ -30,7 +30,7 @@ from hmsa.errors import BadInputError, excerpt, meant
 from hmsa.model import law
 from hmsa.model.equations import Array
 from hmsa.model.laws import elastica
-from hmsa.model.modes import Modes, MOUNTS
+from hmsa.model.modes import BROAD, Modes, MOUNTS
 
 # Degree of the polynomials: the first frequency of the cube is then within 1e-4 of that of its
 # Lame mode (test_continuum).
@@ -42,7 +42,7 @@ _TOGETHER = 1e-3
 # secondary mode is left out.
 _UNSEEN, _WEAKEST = 1e-6, 0.01
 # Secondary modes that are kept, and the maximum ratio of their frequencies. With a third one,
-# `modal` takes up to 3 times as long as the paper's command (H/L 0.1, benchmarks continuum).
+# `modal` takes longer and leaves as much on finite elements (benchmarks continuum).
 _COUNT, _FASTEST = 2, 5.0
 # Shapes H/L: finite elements confirm 0.1 to 4 (benchmarks continuum), bar theory 10.
 _SHAPES = 0.02, 10.0
@@ -54,6 +54,9 @@ _LOGS = -9.0, 3.0
 _STRETCHES = (0.9, 1.1, 1.2)
 # Stretches near rest that determine how the ratios of frequencies change with it.
 _BESIDE = (0.97, 1.03)
+# Ratio of two frequencies below which their modes count as one; and logarithm of the ratio to a
+# mode at rest up to which modes about another stretch belong to it.
+_ALIKE, _REACH = 1.05, 0.1
 
 
 @dataclass(frozen=True)
@@ -103,10 +106,50 @@ def spectrum(shape: float, mount: str, stretch: float = 1.0, j_lim: float = math
         In units of L, G and rho.
 
     """
-    from scipy.linalg import eigh, solve  # slow to import
+    from scipy.linalg import solve  # slow to import
 
-    span = 2.0 * shape if mount == 'glued' else shape
-    basis = _Basis.of(mount, span)
+    basis, stiffness, squared, vectors = _solved(shape, mount, stretch, j_lim)
+    flexible = float(basis.load @ solve(stiffness, basis.load, assume_a='sym'))
+    shares = (vectors.T @ basis.load) ** 2 / squared / flexible
+    # A unit load stretches a free block by 1/3, if it is small.
+    return Spectrum(*_together(np.sqrt(np.abs(squared)), shares), 3.0 * flexible / basis.span)
+
+
+def mode_shapes(shape: float, count: int, points: Array) -> Array:
+    """
+    Return the strongest modes of a free block at rest, by frequency.
+
+    Parameters
+    ----------
+    shape : float
+        H/L.
+    count : int
+        Number of modes.
+    points : ndarray, shape (n, 3)
+        Places in the block, in units of L, L and H from its centre.
+
+    Returns
+    -------
+    ndarray, shape (count, n, 3)
+        Displacements in units of L, with a mean of 1 along the field on the face of the load.
+
+    """
+    basis, _, squared, vectors = _solved(shape, 'free', 1.0, math.inf)
+    strength = (vectors.T @ basis.load) ** 2 / squared
+    strong = np.sort(np.argsort(-strength)[:count])
+    values = basis.at(np.asarray(points, dtype=np.float64))
+    found: Array = np.einsum('njc,jm->mnc', values, vectors[:, strong] / (
+        basis.load @ vectors[:, strong]))
+    return found
+
+
+def _solved(
+        shape: float, mount: str, stretch: float, j_lim: float
+) -> tuple['_Basis', Array, Array, Array]:
+    """Return the basis, its stiffness, and squared frequencies and shapes of all modes."""
+    from scipy.linalg import eigh  # slow to import
+
+    basis = _Basis.of(mount, 2.0 * shape if mount == 'glued' else shape)
     side = stretch ** -0.5
     scale = np.array([side, side, stretch])
     left = 1.0 - (2.0 * side ** 2 + stretch ** 2 - 3.0) / j_lim
@@ -125,11 +168,7 @@ def spectrum(shape: float, mount: str, stretch: float = 1.0, j_lim: float = math
             (component == c)[:, None] & (component == e),
             (4.0 * bend * scale[c] * scale[e] + (_BULK - pressure) * inverse)
             * basis.integral(c, e) + pressure * inverse * basis.integral(e, c), 0.0)
-    squared, vectors = eigh(stiffness, mass)
-    flexible = float(basis.load @ solve(stiffness, basis.load, assume_a='sym'))
-    shares = (vectors.T @ basis.load) ** 2 / squared / flexible
-    # A unit load stretches a free block by 1/3, if it is small.
-    return Spectrum(*_together(np.sqrt(np.abs(squared)), shares), 3.0 * flexible / span)
+    return basis, stiffness, *eigh(stiffness, mass)
 
 
 @dataclass(frozen=True)
@@ -140,6 +179,7 @@ class _Basis:
     degrees: NDArray[np.int64]  #: of its polynomials, shape (3, n)
     tables: tuple[Array, ...]  #: integrals by direction, see `_integrals`
     load: Array  #: mean on the face of the load, along the field, shape (n,)
+    span: float  #: half of the height, all of it if glued
 
     @classmethod
     def of(cls, mount: str, span: float) -> '_Basis':
@@ -168,7 +208,15 @@ class _Basis:
         means, ends = tables[0][0, 0, 0], np.array([float(x(1.0)) for x in along])
         load = np.where(component == 2, 1.0, 0.0) * (
             means[degrees[0]] * means[degrees[1]] * ends[degrees[2]])
-        return cls(component, np.array(degrees), tables, load)
+        return cls(component, np.array(degrees), tables, load, span)
+
+    def at(self, points: Array) -> Array:
+        """Return the displacements of a free block at points from -1 to 1, shape (m, n, 3)."""
+        values = np.prod([
+            np.array([legendre.Legendre.basis(n)(x) for n in range(int(np.max(own)) + 1)]).T[
+                :, own] for x, own in zip(points.T, self.degrees, strict=True)], axis=0)
+        found: Array = values[:, :, None] * (self.component[:, None] == np.arange(3))
+        return found
 
     def integral(self, one: int | None = None, other: int | None = None) -> Array:
         """
@@ -233,7 +281,7 @@ def mounted(shape: float, mount: str, j_lim: float, damping_ratio: float) -> Mou
     Returns
     -------
     Mounted
-        Factors and up to three secondary modes.
+        Factors, and up to two secondary modes and a broad one in place of all weaker ones.
 
     Raises
     ------
@@ -250,17 +298,46 @@ def mounted(shape: float, mount: str, j_lim: float, damping_ratio: float) -> Mou
     free = mount == 'free'
     # A free block deforms uniformly at rest: its compliance exceeds 1 by that of the volume.
     stiffness = 1.0 if free else 1.0 / found.compliance
-    factor = stiffness * 18.0 / (1.0 + 2.0 * shape ** 2) / found.frequencies[found.first] ** 2
-    ratios = found.frequencies / found.frequencies[found.first]
-    # A change of level excites a mode in proportion to its share.
-    strong = sorted([i for i in np.argsort(-found.shares) if 1.0 < ratios[i] <= _FASTEST
-                     and found.shares[i] >= _WEAKEST][:_COUNT])
-    exponents = _exponents(shape, j_lim, found.frequencies[strong]) if free else ()
+    first = found.first
+    factor = stiffness * 18.0 / (1.0 + 2.0 * shape ** 2) / found.frequencies[first] ** 2
+    ratios, shares = _lines(found)
+    # A change of level excites a mode in proportion to its share, several of them slow ones more.
+    strong = sorted([i for i in np.argsort(-shares / ratios) if ratios[i] <= _FASTEST
+                     and shares[i] >= _WEAKEST][:_COUNT])
+    exponents = (
+        _exponents(shape, j_lim, ratios[strong], shares[strong]) if free
+        else ([0.0] * len(strong),) * 2)
+    rows = [*zip(
+        ratios[strong].tolist(), shares[strong].tolist(),
+        (min(damping_ratio * x, _MOST_DAMPED) for x in ratios[strong].tolist()),
+        *exponents, strict=True)]
+    weak = np.delete(np.arange(len(ratios)), strong)
+    left = 1.0 - float(found.shares[first] + np.sum(shares[strong]))
+    if left >= _WEAKEST:
+        # Together they fade sooner than each of them.
+        ratio = float(np.sum(shares[weak]) / np.sum(shares[weak] / ratios[weak]))
+        rows.append((ratio, left, BROAD, 0.0, 0.0))
     return Mounted(
-        stiffness, float(factor), _transverse(shape, j_lim, factor) if free else 1.0, Modes(
-            tuple(ratios[strong].tolist()), tuple(found.shares[strong].tolist()),
-            tuple(min(damping_ratio * x, _MOST_DAMPED) for x in ratios[strong].tolist()),
-            exponents))
+        stiffness, float(factor), _transverse(shape, j_lim, factor) if free else 1.0,
+        Modes.of_numbers(rows))
+
+
+def _lines(found: Spectrum) -> tuple[Array, Array]:
+    """Return frequency ratios and shares of the modes above the first, near ones as one."""
+    groups: list[list[tuple[float, float]]] = []
+    for ratio, share in zip(
+            found.frequencies / found.frequencies[found.first], found.shares, strict=True):
+        if groups and ratio < _mean(groups[-1]) * _ALIKE:
+            groups[-1].append((ratio, share))
+        elif ratio > 1.0:
+            groups.append([(ratio, share)])
+    return (np.array([_mean(x) for x in groups]),
+            np.array([sum(y for _, y in x) for x in groups]))
+
+
+def _mean(lines: Sequence[tuple[float, float]]) -> float:
+    """Return the mean of ratios, weighted by their shares."""
+    return float(sum(x * y for x, y in lines) / sum(y for _, y in lines))
 
 
 def clamped(damping_ratio: float) -> Modes:
@@ -275,15 +352,38 @@ def clamped(damping_ratio: float) -> Modes:
         (second.ratio,), (second.share,), (min(damping_ratio * second.ratio, _MOST_DAMPED),))
 
 
-def _exponents(shape: float, j_lim: float, frequencies: Array) -> tuple[float, ...]:
-    """Return the exponents of the stretch with which the ratios of some frequencies grow."""
-    logs = []
-    for stretch in _BESIDE:
-        there = spectrum(shape, 'free', stretch, j_lim)
-        near = [np.argmin(abs(there.frequencies - x)) for x in frequencies]
-        logs.append(np.log(there.frequencies[near] / there.frequencies[there.first]))
-    found: Array = (logs[1] - logs[0]) / math.log(_BESIDE[1] / _BESIDE[0])
-    return tuple(np.clip(found, -5.0, 5.0).tolist())
+def _exponents(
+        shape: float, j_lim: float, ratios: Array, shares: Array
+) -> tuple[list[float], list[float]]:
+    """Return the exponents of the stretch in the frequency ratios and shares of some modes."""
+    low, high = (_near(shape, j_lim, x, ratios)[0] for x in _BESIDE)
+    exponents: Array = np.log(high / low) / math.log(_BESIDE[1] / _BESIDE[0])
+    logs: Array = np.log(_STRETCHES)
+    grown = np.array([
+        _odds(_near(shape, j_lim, x, ratios * x ** exponents)[1]) for x in _STRETCHES])
+    slopes: Array = logs @ (grown - _odds(shares)) / (logs @ logs)
+    return np.clip(exponents, -5.0, 5.0).tolist(), np.clip(slopes, -10.0, 10.0).tolist()
+
+
+def _near(shape: float, j_lim: float, stretch: float, ratios: Array) -> tuple[Array, Array]:
+    """
+    Return frequency ratios and shares about a stretch of the modes nearest to some ratios.
+
+    Modes that come close to each other exchange their shares, and count as one.
+    """
+    found = spectrum(shape, 'free', stretch, j_lim)
+    lines = found.frequencies / found.frequencies[found.first]
+    apart = np.abs(np.log(lines[:, None] / ratios))
+    own = (apart < _REACH) & (apart == np.min(apart, axis=1, keepdims=True))
+    own |= apart == np.min(apart, axis=0)
+    parts = own * found.shares[:, None]
+    return lines @ parts / np.sum(parts, axis=0), np.sum(parts, axis=0)
+
+
+def _odds(shares: Array) -> Array:
+    """Return the logarithms of shares relative to that of the first mode."""
+    found: Array = np.log(shares / (1.0 - np.sum(shares)))
+    return found
 
 
 def _transverse(shape: float, j_lim: float, factor: float) -> float:

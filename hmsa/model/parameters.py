@@ -136,15 +136,14 @@ class NondimensionalParameters:
 
         Those of the first mode come first, then positions and rates of the others in turns.
         """
-        modes = self.modes
-        seen, speed = (modes.all_of(x, others[i::2]) for i, x in enumerate((stretch, rate)))
+        seen, speed = self.modes.observed(stretch, rate, others)
         if self.law is None or self.law.family != ELASTICA:
             return seen, speed
         from hmsa.model.laws import elastica  # as above
 
         # The share of the second mode of a bent beam is another one than that of a straight beam.
         gain, slope = elastica.lever(stretch)
-        beside, apart, share = others[0] - stretch, others[1] - rate, modes.shares[0]
+        beside, apart, share = others[0] - stretch, others[1] - rate, self.modes.shares[0]
         return (seen + share * (gain - 1.0) * beside,
                 speed + share * ((gain - 1.0) * apart + slope * rate * beside))
 
@@ -152,6 +151,15 @@ class NondimensionalParameters:
     def elastic(self) -> 'NondimensionalParameters':
         """The group without branches."""
         return replace(self, creep=Creep()) if self.creeps else self
+
+    @cached_property
+    def ringing(self) -> 'NondimensionalParameters':
+        """The group without secondary modes that hardly ring."""
+        kept = self.modes.ringing
+        if len(kept) == len(self.modes.ratios):
+            return self
+        numbers = self.modes.numbers
+        return replace(self, modes=Modes.of_numbers([numbers[i] for i in kept]))
 
     def beyond(self, stretch: float, name: str = 'stretch') -> str:
         """Return why a stretch, by a name, is beyond the limits; empty if it is not."""
@@ -290,10 +298,12 @@ class ActuatorParameters:
             raise BadInputError(
                 f'transverse_mass_factor is {self.transverse_mass_factor:g}: expected 1 for a '
                 'beam, which has no transverse inertia of its own')
-        if any(self.modes.exponents) and self.rest == 0.0:
-            raise BadInputError(
-                'modes.ratio_exponent is given for a beam: expected none, as its deflection at '
-                'rest is 0')
+        for name, exponents in (
+                ('ratio', self.modes.exponents), ('share', self.modes.share_exponents)):
+            if any(exponents) and self.rest == 0.0:
+                raise BadInputError(
+                    f'modes.{name}_exponent is given for a beam: expected none, as its deflection '
+                    'at rest is 0')
         self.creep.check(scales[0])
 
     @classmethod

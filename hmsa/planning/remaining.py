@@ -1,8 +1,8 @@
 """
 Vibration that a command leaves in an actuator with secondary modes.
 
-Only `modal` brings all modes to rest. Other shapers plan the first mode, and what their levels do
-to the others remains after the move.
+Only `modal` brings other modes than the first to rest, if they ring. Other shapers plan the first
+mode, and what their levels do to the others remains after the move.
 """
 
 from collections.abc import Sequence
@@ -21,8 +21,6 @@ from hmsa.planning.shapers.request import MoveRequest
 
 # Samples of the first period after a move, and their tolerance.
 _LOOK, _RTOL = 100, 1e-7
-# Codes of moves that bring all modes to rest, or do not move.
-_AT_REST = (Code.MODAL, Code.HOLD)
 # Vibration in fractions of the move below which nothing is told, and from which another shaper is
 # advised; and that which an unshaped step leaves at least, so that only then it is computed.
 _TOLD, _MUCH, _LIKE_A_STEP = 5e-4, 1e-2, 0.4
@@ -37,6 +35,7 @@ class Remaining:
     vibration: float
     mode: int  #: number of the mode that contributes most, from 1
     ratio: float  #: of its frequency to that of the first
+    broad: bool = False  #: whether this stands for all weak modes together
     #: Vibration of an unshaped step to the same target if that is less, else NaN.
     step: float = math.nan
 
@@ -47,15 +46,17 @@ class Remaining:
 
     def of(self, target: float, code: Code) -> str:
         """Return a sentence about the move to a target."""
-        by = 'the first mode' if self.mode == 1 else (
-            f'mode {self.mode} at {self.ratio:.3g} times the first frequency')
+        at = f'at {self.ratio:.3g} times the first frequency'
+        by = ('the first mode' if self.mode == 1 else f'weak modes {at}' if self.broad
+              else f'mode {self.mode} {at}')
         text = (
             f'the move to {target:g} by {code} leaves a vibration of {_percent(self.vibration)} '
             f'of the move, most of it in {by}')
         if self.worse:
             return (f'{text}, and an unshaped step {_percent(self.step)}: expected the shaper '
-                    'modal, which leaves none, or two_step')
-        return text + (': shaper modal leaves none' if self.vibration >= _MUCH else '')
+                    'modal, which leaves least, or two_step')
+        return text + (': shaper modal leaves less' if self.vibration >= _MUCH and (
+            code is not Code.MODAL) else '')
 
 
 def _percent(fraction: float) -> str:
@@ -65,13 +66,14 @@ def _percent(fraction: float) -> str:
 
 def remaining(request: MoveRequest, move: Move) -> Remaining | None:
     """
-    Return what a move leaves; None without secondary modes, and after `modal`.
+    Return what a move leaves; None without secondary modes, and if `modal` brings all to rest.
 
     A move that only approaches its target has none either, unless secondary modes vibrate.
     """
     modes = request.material.modes
     size = abs(request.target - request.state.stretch)
-    if not modes or move.code in _AT_REST or size < _LEAST_MOVE:
+    if not modes or size < _LEAST_MOVE or move.code is Code.HOLD or (
+            move.code is Code.MODAL and request.material.ringing is request.material):
         return None
     half = math.pi / request.frequency
     start = move.duration if move.duration < math.inf else move.levels[-1].time + half
@@ -79,8 +81,7 @@ def remaining(request: MoveRequest, move: Move) -> Remaining | None:
     if seen is None:
         return None
     rows, whole = seen
-    parts = [modes.first * np.ptp(rows[0]), *(
-        abs(x) * np.ptp(y) for x, y in zip(modes.shares, rows[1:], strict=True))]
+    parts = [abs(x) * np.ptp(y) for x, y in zip(modes.at(request.target), rows, strict=True)]
     most, vibration = int(np.argmax(parts)), float(np.ptp(whole)) / size
     if vibration < _TOLD:
         return None
@@ -89,7 +90,8 @@ def remaining(request: MoveRequest, move: Move) -> Remaining | None:
         there = _after(request, [Level(0.0, request.holding_load())], half, 2.0 * half)
         left = math.inf if there is None else float(np.ptp(there[1])) / size
         step = left if left < vibration else math.nan
-    return Remaining(vibration, most + 1, (1.0, *modes.ratios)[most], step)
+    broad = most > 0 and most - 1 not in modes.ringing
+    return Remaining(vibration, most + 1, (1.0, *modes.ratios)[most], broad, step)
 
 
 def _after(

@@ -8,12 +8,12 @@
 
 namespace hmsa {
 // Indices in theta; from first_branch on gamma, tau, flow rule and its constants of each branch, then
-// frequency ratio, share, damping ratio and the exponent of the ratio of each secondary mode.
+// frequency ratio, share, damping ratio and the exponents of ratio and share of each secondary mode.
 // Beyond all indices, constant i of the hyperelastic model is the first plus i, and the start time
 // of piece m the second plus m. Two forces that are zero in every motion only serve
 // differentiation: one against the motion at any rate, and one with the square of the rate.
 enum Theta { stiffness_of, damping_of, drive_of, force_of, lag_of, stretch_of, rate_of, first_branch };
-constexpr int branch_places = 3 + flow_constants, mode_places = 4;
+constexpr int branch_places = 3 + flow_constants, mode_places = 5;
 constexpr int friction_of = 400, square_of = 401, constant_of = 500, switch_of = 1000;
 // Rate, relative to the fastest frequency, over which the friction changes sign.
 constexpr double soft_rate = 3e-3;
@@ -55,7 +55,9 @@ struct Recorded {
 // Secondary modes with derivatives by parameters: oscillators about the rest under the present load.
 template <class S> struct Modal {
     int count = 0;
-    S ratio[most_modes], share[most_modes], damping[most_modes], exponent[most_modes];
+    S ratio[most_modes], share[most_modes], damping[most_modes], exponent[most_modes],
+        share_exponent[most_modes];
+    bool graded = false;  // whether shares change with the stretch
     const double *material = nullptr;
     // Rest, its natural frequency and the square of it under the load that was looked at last, and
     // their derivatives by this load.
@@ -98,13 +100,32 @@ template <class S> struct Modal {
             by[1] = square * grown * grown * (middle - at[0]) - frequency * grown * damping[k] * 2.0 * at[1];
         }
     }
-    // What a sensor sees of the first mode and the others: a stretch or a rate.
-    HMSA_INLINE S seen(const S &first, const S *others) const
+    // What a sensor sees of a state: stretch and rate of the first mode, and of the others.
+    HMSA_INLINE void seen(const S *y, const S *others, S &stretch, S &rate) const
     {
-        S sum = first;
-        for (int k = 0; k < count; k++)
-            sum = sum + share[k] * (others[2 * k] - first);
-        return sum;
+        S here[most_modes], part = S{} + 1.0, slope{};  // of the sum of shares
+        for (int k = 0; k < count; k++) {
+            here[k] = share[k];
+            if (graded) {
+                const double sign = get(value(share[k]), 0) < 0 ? -1 : 1;
+                here[k] = here[k] * power(y[0], share_exponent[k]);
+                part = part + (here[k] - share[k]) * sign;
+                slope = slope + here[k] * share_exponent[k] * sign;
+            }
+        }
+        if (graded)
+            part = inverse(part), slope = slope * part;
+        stretch = y[0], rate = y[1];
+        for (int k = 0; k < count; k++) {
+            const S beside = others[2 * k] - y[0];
+            S apart = others[2 * k + 1] - y[1];
+            if (graded) {
+                here[k] = here[k] * part;
+                apart = apart + (share_exponent[k] - slope) * y[1] * inverse(y[0]) * beside;
+            }
+            stretch = stretch + here[k] * beside;
+            rate = rate + here[k] * apart;
+        }
     }
 };
 
@@ -182,6 +203,9 @@ template <class C, class System, int NB = most_branches> struct Response {
                 const int at = first_branch + branch_places * creeping + mode_places * k;
                 modes.ratio[k] = seeded_at(at), modes.share[k] = seeded_at(at + 1);
                 modes.damping[k] = seeded_at(at + 2), modes.exponent[k] = seeded_at(at + 3);
+                modes.share_exponent[k] = seeded_at(at + 4);
+                modes.graded |= of.theta[at + 4] != 0;
+                each([&](int, int wanted) { modes.graded |= wanted == at + 4; });
             }
         }
     }
@@ -223,9 +247,9 @@ template <class C, class System, int NB = most_branches> struct Response {
     {
         if constexpr (modal)
             if (modes.count) {
-                const S *others = y + 2 + creeping;
-                const S rate = modes.seen(y[1], others + 1);
-                return put(i, modes.seen(y[0], others) + rate * after, rate);
+                S stretch, rate;
+                modes.seen(y, y + 2 + creeping, stretch, rate);
+                return put(i, stretch + rate * after, rate);
             }
         put(i, after ? y[0] + y[1] * after : y[0], y[1]);
     }

@@ -1,5 +1,5 @@
 """
-Rest of the first mode and of all secondary modes, for actuators that are continua.
+Rest of the first mode and of all secondary modes that ring, for actuators that are continua.
 
 A move has two free levels for the first mode and two more for each secondary one, and further ones
 on real hardware as in `free`.
@@ -13,6 +13,7 @@ for each of them, and changed as little as rest demands. It has more levels than
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 import math
 
 import numpy as np
@@ -32,11 +33,14 @@ from hmsa.planning.shooting import Attempt, heights, solve, within_limits
 # others without (benchmarks continuum).
 _LENGTHS = (1.0, 1.06, 0.94, 1.14, 1.25, 1.4, 1.6, 2.0)
 # Up to this order a block has as many levels as conditions. Beyond, it has this many, and takes
-# this fraction of the half periods: at order 2, less leaves more than 3 % (benchmarks continuum).
-_PLAIN, _SMOOTH, _SHORTER = 2, 12, 0.96
-# Weight of the vibration by an error of the first frequency against bends of the levels: of 0 to
+# this fraction of the half periods.
+_PLAIN, _SMOOTH, _SHORTER = 2, 12, 0.975
+# Frequency ratio of the weak modes from which a block takes this fraction of the half periods at
+# order 2. Where they are slower, as much leaves more than 3 % (benchmarks continuum).
+_FAR, _BRISK = 4.0, 0.955
+# Weight of the vibration by an error of all frequencies against bends of the levels: of 0 to
 # infinity, that which leaves least on finite elements.
-_ROBUST = 2.0
+_ROBUST = 10.0
 # Largest load beyond those of start and end, in units of the largest change that the motion needs.
 _BEYOND = 0.3
 # Durations of levels in units of those of their ramps, at least.
@@ -49,15 +53,18 @@ _Guess = tuple[list[float], list[float]]
 
 def modal(request: MoveRequest) -> Move:
     """
-    Come to rest with all modes.
+    Come to rest with all modes that ring.
 
-    A block takes ``request.order`` half periods of the first mode, less 4 % from order 3 on; a
-    beam as long as the two-step command, half a period of each secondary mode, and half periods of
-    the first beyond order 2.
+    A block takes ``request.order`` half periods of the first mode, or up to 5 % less; a beam as
+    long as the two-step command, half a period of each secondary mode, and half periods of the
+    first beyond order 2.
 
     Without secondary modes, the two-step command does so, and is returned. Raise `RefusedError` if
     no such command keeps the limits.
     """
+    brisk = any(x >= _FAR for i, x in enumerate(request.material.modes.ratios)
+                if i not in request.material.modes.ringing)
+    request = _of_ringing(request)
     if not request.material.modes:
         return two_step(request)
     holding = request.holding_load()
@@ -66,7 +73,7 @@ def modal(request: MoveRequest) -> Move:
     reach = _BEYOND * _largest_change(request, holding)
     limits = min(request.load, holding) - reach, max(request.load, holding) + reach
     widest: Attempt = None
-    for found in _solutions(request, holding):
+    for found in _solutions(request, holding, brisk=brisk):
         loads = [x.load for x in found[0]]
         if limits[0] <= min(loads) and max(loads) <= limits[1]:
             return Move(Code.MODAL, *found)
@@ -77,6 +84,18 @@ def modal(request: MoveRequest) -> Move:
             f'no levels within the limits bring all modes to rest at {request.named_target}: '
             'expected wider limits, a smaller move, or another shaper')
     return Move(Code.MODAL, *widest)
+
+
+def _of_ringing(request: MoveRequest) -> MoveRequest:
+    """Return the request without modes that are too damped to ring."""
+    material = request.material
+    if material.ringing is material:
+        return request
+    count, followed = len(material.branches), followed_by(request.state, material)
+    return replace(
+        request, material=material.ringing,
+        state=replace(request.state, followed=(*followed[:count], *(
+            followed[count + 2 * i + j] for i in material.modes.ringing for j in (0, 1)))))
 
 
 def _modes_rest(request: MoveRequest) -> bool:
@@ -97,9 +116,12 @@ def _largest_change(request: MoveRequest, holding: float) -> float:
         abs(state.rate) * stiffness / request.frequency)
 
 
-def _solutions(request: MoveRequest, holding: float) -> Iterator[tuple[tuple[Level, ...], float]]:
+def _solutions(
+        request: MoveRequest, holding: float, *, brisk: bool
+) -> Iterator[tuple[tuple[Level, ...], float]]:
     """Yield commands that end at rest within the limits."""
-    guesses = _equal if request.material.rest != 0.0 else _around_two_steps
+    guesses = (partial(_equal, brisk=brisk) if request.material.rest != 0.0
+               else _around_two_steps)
     before: tuple[float, ...] = ()
     for wanted, loads in guesses(request, holding):
         durations = tuple(_on_grid(x, request) for x in wanted)
@@ -113,12 +135,13 @@ def _solutions(request: MoveRequest, holding: float) -> Iterator[tuple[tuple[Lev
             yield found
 
 
-def _equal(request: MoveRequest, holding: float) -> Iterator[_Guess]:
+def _equal(request: MoveRequest, holding: float, *, brisk: bool) -> Iterator[_Guess]:
     """Yield equal durations, and loads that change smoothly from the present one to the last."""
     delivery = request.delivery
     count = request.unknowns + 2 * len(request.material.modes.ratios)
     smooth = request.order > _PLAIN
-    whole = (_SHORTER if smooth else 1.0) * request.order * math.pi / request.frequency
+    whole = (_SHORTER if smooth else _BRISK if brisk else 1.0) * (
+        request.order * math.pi / request.frequency)
     hardware = delivery.lag + delivery.ramp(holding - request.load)
     # A raised cosine, which all conditions change.
     shares = [0.5 * (1.0 - math.cos(math.pi * (i + 1) / (count + 1))) for i in range(count)]
@@ -139,7 +162,8 @@ def _smooth(each: float, request: MoveRequest) -> Array:
     frequency = request.frequency
     damping = float(law.damping(target, packed) / law.mass(target, packed)) / (2.0 * frequency)
     ratios = [(1.0, damping), *(
-        (ratio * target ** exponent, damping) for ratio, _, damping, exponent in modes.numbers)]
+        (ratio * target ** exponent, damping)
+        for ratio, _, damping, exponent, _ in modes.numbers)]
     left = each * np.arange(-_SMOOTH, 1)
     effects = [np.exp(frequency * ratio * complex(y, math.sqrt(max(1.0 - y * y, 0.0))) * left)
                for ratio, y in ratios]
@@ -150,9 +174,11 @@ def _smooth(each: float, request: MoveRequest) -> Array:
         rows: Array = np.array([effect.real, effect.imag])
         return rows[:, :-1] - rows[:, 1:], rows[:, -1]
 
-    by_frequency = parts(math.sqrt(_ROBUST) * frequency * left * effects[0])
-    free = np.concatenate([bends[:, 2:-2], by_frequency[0]])
-    last = np.concatenate([bends[:, -2:].sum(axis=1), by_frequency[1]])
+    # What the same relative error of each frequency leaves.
+    by_frequency = [parts(math.sqrt(_ROBUST) * share * frequency * x * left * y) for share, (
+        x, _), y in zip(modes.at(target), ratios, effects, strict=True)]
+    free, last = (np.concatenate(x) for x in zip(
+        (bends[:, 2:-2], bends[:, -2:].sum(axis=1)), *by_frequency, strict=True))
     conditions, ends = (np.concatenate(x) for x in zip(
         *(parts(x) for x in effects), strict=True))
     # Least squares with Lagrange multipliers; frequencies that coincide give equal conditions.
