@@ -8,12 +8,14 @@ made otherwise.
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 import math
 from pathlib import Path
 import re
 import sys
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 import numpy as np
@@ -26,9 +28,12 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
 from benchmarks.beam_segments import Chain  # noqa: E402
+from benchmarks.block_elements import Block  # noqa: E402
+from hmsa import Actuator  # noqa: E402
 from hmsa.interfaces.actuator import actuator_from  # noqa: E402
 from hmsa.interfaces.outcome import Outcome  # noqa: E402
 from hmsa.interfaces.parameters import BLOCK  # noqa: E402
+from hmsa.model.continuum import mode_shapes, spectrum  # noqa: E402
 from hmsa.model.creep import Creep  # noqa: E402
 from hmsa.model.delivery import Delivery  # noqa: E402
 from hmsa.model.equations import elastic_force, stretch_limits  # noqa: E402
@@ -40,6 +45,7 @@ from hmsa.model.simulation import ActuatorSimulation, simulate  # noqa: E402
 from hmsa.model.units import NANOSECONDS  # noqa: E402
 from hmsa.planning.planner import Options, Planner  # noqa: E402
 from hmsa.planning.sequence import plan_sequence, Setpoint  # noqa: E402
+from hmsa.planning.shapers import get_shaper  # noqa: E402
 from hmsa.planning.two_step import plan_two_step  # noqa: E402
 from hmsa.report import looks, style  # noqa: E402
 from hmsa.report.arrivals import Part  # noqa: E402
@@ -334,6 +340,29 @@ def beam(path: Path) -> None:
             left, style.axis('time', 't', 'ms'), style.axis('error', unit='% of step'), 'c')
 
 
+def modes(path: Path) -> None:
+    """Draw the three strongest modes of a cube, in the plane through its centre."""
+    found, count, swing = spectrum(1.0, 'free'), 3, 0.12
+    strong = np.sort(np.argsort(-found.shares)[:count])
+    fine, coarse = np.linspace(-1.0, 1.0, 61), np.linspace(-1.0, 1.0, 9)
+    lines = [np.column_stack(y) for x in coarse for y in (
+        (fine, 0.0 * fine, x + 0.0 * fine), (x + 0.0 * fine, 0.0 * fine, fine))]
+    moved = mode_shapes(1.0, count, np.concatenate(lines)).reshape(count, len(lines), -1, 3)
+    with style.picture(path, 2.4, SCREEN) as figure:
+        for i, (axes, place) in enumerate(zip(figure.subplots(1, count), strong, strict=True)):
+            for line, away in zip(lines, moved[i], strict=True):
+                # Modes of small share move inside more than on the face of the load.
+                now = line + swing * away / np.max(np.abs(moved[i]))
+                axes.plot(now[:, 0], now[:, 2], color=looks.BLUE, linewidth=0.8)
+            axes.add_patch(Rectangle(
+                (-1.0, -1.0), 2.0, 2.0, fill=False, color=looks.GREY, linestyle='--'))
+            axes.set_aspect('equal')
+            axes.set_axis_off()
+            ratio = found.frequencies[place] / found.frequencies[found.first]
+            axes.set_title(
+                f'{ratio:.2f} $f_1$, {100.0 * found.shares[place]:.0f} %', fontsize='small')
+
+
 def simulated(*setpoints: tuple[float, float], rate: float) -> Run:
     """Return the run of setpoints (stretch, span in s), as its recorder would see it."""
     block, start, lead = paper_actuator(), NANOSECONDS, 5_000_000
@@ -429,6 +458,63 @@ def moving(path: Path) -> None:
     frames[0].save(path, save_all=True, append_images=frames[1:], duration=90, loop=0)
 
 
+def modal(path: Path) -> None:
+    """Draw a move of a cube of finite elements as an animation, by two_step and by modal."""
+    target, enlarged, ratio, j_lim = 1.2, 2.0, 0.05, 5.0
+    paper = Actuator(half_length=0.01, damping_ratio=ratio, chain_limit=j_lim)
+    block, material = paper.replace(mount='free'), paper.model.material
+    unit, slower = paper.block.time_unit, block.block.time_unit / paper.block.time_unit
+    time = np.linspace(-0.5, 12.0, 81)
+    runs = []
+    for actuator, shaper, factor in ((paper, 'two_step', 1.0), (block, 'modal', slower)):
+        move = get_shaper(shaper)(MoveRequest(State(1.0), target, actuator.model.material))
+        starts = np.array([-math.inf, *(factor * x.time for x in move.levels)])
+        loads = [0.0, *(x.load for x in move.levels)]
+        elements = Block(1.0, j_lim, material.zeta * material.c1 / 6.0, (5, 5, 5))
+        section = np.flatnonzero(elements.position[:, 1] < 1e-9)
+        frames_of, now = [elements.position[section]], float(time[0])
+        stretches = [1.0]
+        for end in time[1:]:
+            edges = [now, *(x for x in starts if now < x < end), float(end)]
+            elements.follow([
+                (until - begin, loads[int(np.searchsorted(starts, begin, 'right')) - 1])
+                for begin, until in pairwise(edges)])
+            frames_of.append(elements.position[section])
+            stretches.append(elements.stretch)
+            now = float(end)
+        runs.append((np.array(frames_of), np.array(stretches)))
+    figure = Figure(figsize=(6.4, 2.9), dpi=100, layout='constrained')
+    canvas = FigureCanvasAgg(figure)
+    blocks, curves = figure.subplots(1, 2, width_ratios=[1.3, 1.2])
+    blocks.set(xlim=(-1.35, 4.05), ylim=(-1.6, 1.6), xticks=[0.0, 2.7], yticks=[])
+    blocks.set_xticklabels(["two_step, paper's model", 'modal'])
+    blocks.set_aspect('equal')
+    curves.set(xlim=(1e3 * unit * time[0], 1e3 * unit * time[-1]), ylim=(0.99, 1.28))
+    curves.axhline(target, **style.TARGET)
+    style.finish(curves, style.axis('time', 't', 'ms'), style.axis('mean stretch', r'\lambda'))
+    side = round(math.sqrt(len(runs[0][0][0])))
+    looks_of = (style.UNSHAPED, style.SHAPED)
+    lines = [curves.plot([], [], **x)[0] for x in looks_of]
+    grids = [blocks.add_collection(LineCollection([], color=x['color'], linewidths=0.8))
+             for x in looks_of]
+    frames = []
+    for i in range(len(time)):
+        for j, (line, grid, (places, stretches)) in enumerate(
+                zip(lines, grids, runs, strict=True)):
+            line.set_data(1e3 * unit * time[:i + 1], stretches[:i + 1])
+            # An eighth of the block by symmetry, so a quarter of the section.
+            quarter = (places[0] + enlarged * (places[i] - places[0]))[:, [0, 2]].reshape(
+                side, side, 2)
+            half = np.concatenate([quarter[:0:-1] * [-1.0, 1.0], quarter])
+            whole = np.concatenate([half[:, :0:-1] * [1.0, -1.0], half], axis=1) + [2.7 * j, 0.0]
+            grid.set_segments([*whole, *whole.swapaxes(0, 1)])
+        canvas.draw()
+        figure.set_layout_engine('none')
+        frames.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert('RGB').quantize(
+            32, dither=Image.Dither.NONE))
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=90, loop=0)
+
+
 def figure(number: int) -> Callable[[Path], None]:
     """Return what draws a figure of the paper."""
     return lambda path: draw_figure(FIGURES[number], [path], SCREEN)
@@ -440,9 +526,9 @@ PICTURES: dict[str, Callable[[Path], None]] = {
     'figure_08': figure(8), 'theory_force': force, 'theory_two_steps': two_steps,
     'theory_paths': energy, 'theory_deliveries': deliveries, 'theory_smooth': smooth,
     'laws': laws, 'entanglements': entanglements, 'temperature': temperature, 'creep': creep,
-    'beam': beam, **STUDIES}
+    'beam': beam, 'modes': modes, **STUDIES}
 #: What draws each animation.
-ANIMATIONS: dict[str, Callable[[Path], None]] = {'moving': moving}
+ANIMATIONS: dict[str, Callable[[Path], None]] = {'moving': moving, 'modal': modal}
 
 
 def main() -> int:

@@ -283,11 +283,13 @@ def test_the_pictures_of_the_documentation_are_what_the_package_draws_now(
 
 
 @pytest.mark.slow
-def test_the_animation_of_the_readme_is_what_the_package_draws_now(tmp_path: Path) -> None:
-    shown = IMAGES / 'moving.gif'
-    assert shown.stat().st_size < 500_000
-    script().ANIMATIONS['moving'](tmp_path / 'moving.gif')
-    with Image.open(tmp_path / 'moving.gif') as drawn, Image.open(shown) as kept:
+@pytest.mark.parametrize(('name', 'most'), [('moving', 500_000), ('modal', 1_000_000)])
+def test_the_animations_are_what_the_package_draws_now(
+        name: str, most: int, tmp_path: Path) -> None:
+    shown = IMAGES / f'{name}.gif'
+    assert shown.stat().st_size < most
+    script().ANIMATIONS[name](tmp_path / f'{name}.gif')
+    with Image.open(tmp_path / f'{name}.gif') as drawn, Image.open(shown) as kept:
         assert (drawn.size, drawn.n_frames) == (kept.size, kept.n_frames)
         for frame in (0, 10, 80):
             shades = []
@@ -295,7 +297,7 @@ def test_the_animation_of_the_readme_is_what_the_package_draws_now(tmp_path: Pat
                 image.seek(frame)
                 shades.append(np.asarray(image.convert('L').resize((80, 36)), dtype=np.float64))
             assert np.mean(np.abs(shades[0] - shades[1])) < MEAN, (
-                'draw it anew with make pictures ARGS=moving')
+                f'draw it anew with make pictures ARGS={name}')
 
 
 def test_every_picture_of_the_documentation_is_drawn_by_the_script() -> None:
