@@ -154,7 +154,7 @@ $(VENV)/.control_msgs: $(wildcard test/action_interfaces/* test/action_interface
 $(VENV)/.motion: $(wildcard hmsa/*.c hmsa_lab/bench/*.cpp \
 	hmsa_lab/bench/hmsa_board/*.hpp hmsa/judge/*.cpp hmsa/motion/*.cpp hmsa/motion/hmsa/*.hpp) | $(VENV)/.installed
 	@test -e $@ && test -z "$$(find $^ -newer $@)" \
-	|| { echo "Compiling the motion"; $(BIN)/python scripts/narrate.py $(BIN)/python setup.py build_ext --inplace; }
+	|| { echo "Compiling the motion"; $(BIN)/python scripts/narrate.py $(BIN)/python setup.py --quiet build_ext --inplace; }
 	@touch $@
 
 # An environment whose Python does not start (moved, or its base removed) is made anew too.

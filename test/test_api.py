@@ -734,6 +734,7 @@ def test_a_law_is_chosen_by_option(files, capsys):
 @pytest.mark.parametrize(('words', 'said'), [
     (['plan', '1.1:0.5'], 'if seconds were meant, name the actuator with --params-file'),
     (['plan', '1.1:10', '--law', 'rubber'], 'expected one of gent'),
+    (['plan', '1.1:10', '--law', 'yeho:c10=1kPa'], 'did you mean yeoh?'),
     (['plan', '1.1:10', '--law', 'yeoh:c10'], 'expected KEY=VALUE'),
     (['plan', '1.1:10', '--law', 'yeoh'], 'as in --law yeoh:c10=VALUE'),
     (['plan', '1.1:10', '--law', 'gent', '--params-file', 'actuator.yaml'], 'both --params-file'),
@@ -746,6 +747,9 @@ def test_a_law_is_chosen_by_option(files, capsys):
      'time and stretch; did you mean triangle?'),
     (['simulate', 'nothing.csv'], 'nothing.csv cannot be read'),
     (['simulate', 'levels.csv', '--noise', '-1'], 'noise is -1'),
+    (['simulate', 'levels.csv', '--picture', 'x.png', '--panels', 'respons'],
+     'did you mean response?'),
+    (['identify', 'levels.csv', '--known', 'remanance=0.1'], 'did you mean remanence?'),
     (['simulate', 'levels.csv', '--out', 'run.txt'], 'expected a name that ends in .csv'),
     (['compare', 'one'], 'expected two runs or more'),
     (['compare', 'one', 'two'], 'one does not exist'),

@@ -311,8 +311,8 @@ def test_seconds_of_an_epoch_are_as_good_as_those_of_the_run(folder, capsys):
 
 
 @pytest.mark.parametrize(('time', 'field', 'message'), [
-    (1e3, 1.0, 'a shear_modulus of 0.01 Pa, in samples 1 s apart: .*"time [ms]"'),
-    (1e6, 1.0, 'shear_modulus of 1.*e-08 Pa, in samples 1e.03 s apart: .*"time [us]"'),
+    (1e3, 1.0, 'a shear_modulus of 0.01 Pa, with samples 1 s apart: .*"time [ms]"'),
+    (1e6, 1.0, 'shear_modulus of 1.*e-08 Pa, with samples 1e.03 s apart: .*"time [us]"'),
     (1.0, 1e-3, 'a remanence of 100 T, .*flux densities in T')])
 def test_numbers_of_no_elastomer_are_refused_with_the_unit_that_would_explain_them(
         folder, capsys, time, field, message):

@@ -18,7 +18,7 @@ from typing import Any, TYPE_CHECKING
 
 from hmsa.cli.options import add_command, JSON, of_unit, show, temperature_option
 from hmsa.cli.progress import progress
-from hmsa.errors import BadInputError
+from hmsa.errors import BadInputError, meant
 from hmsa.files import check_targets, may_be_bag, write_text
 from hmsa.interfaces.quantities import number_of
 
@@ -141,7 +141,7 @@ def known_of(text: str) -> tuple[dict[str, float], dict[str, float]]:
         if not equals or name not in QUANTITIES:
             raise BadInputError(
                 f'--known has {part!r}: expected NAME=VALUE or NAME=VALUE+-STD, with a name of '
-                f'{", ".join(QUANTITIES)}')
+                f'{", ".join(QUANTITIES)}' + (meant(name, QUANTITIES) if equals else ''))
         unit = QUANTITIES[name].unit
         value, known, std = (x.strip() for x in rest.partition('+-'))
         values[name] = number_of(value, unit, name)

@@ -6,7 +6,7 @@ import inspect
 from pathlib import Path
 from typing import Any, TYPE_CHECKING, TypeVar
 
-from hmsa.errors import assume, BadInputError, excerpt
+from hmsa.errors import assume, BadInputError, excerpt, meant
 
 if TYPE_CHECKING:
     from hmsa.api.actuator import Actuator
@@ -45,7 +45,8 @@ def law_of(text: str) -> tuple[str, dict[str, Any]]:
 
     name, _, rest = text.partition(':')
     if name not in LAWS:
-        raise BadInputError(f'--law is {excerpt(name)}: expected one of {", ".join(LAWS)}')
+        raise BadInputError(
+            f'--law is {excerpt(name)}: expected one of {", ".join(LAWS)}' + meant(name, LAWS))
     known = {x.name.partition('.')[2]: x for x in LAWS[name].constants}
     constants: dict[str, Any] = {}
     for part in filter(None, rest.split(',')):

@@ -234,7 +234,8 @@ def quantity_of(name: str) -> Quantity:
     found = QUANTITIES.get(name) or _OF_LAWS.get('.'.join(name.split('.')[:2]))
     if found is None:
         raise BadInputError(
-            f'unknown parameter {name!r}: expected some of {", ".join(QUANTITIES)}')
+            f'unknown parameter {name!r}: expected some of {", ".join(QUANTITIES)}'
+            + meant(name, QUANTITIES))
     return found
 
 

@@ -11,7 +11,7 @@ import math
 import re
 from typing import Any
 
-from hmsa.errors import BadInputError, excerpt
+from hmsa.errors import BadInputError, excerpt, meant
 from hmsa.model.flows import CONSTANTS, FLOWS
 from hmsa.model.laws import LAWS
 from hmsa.model.thermal import COLDEST, HOTTEST, Thermal
@@ -123,7 +123,7 @@ class ParameterSpec:
         if self.choices and value not in self.choices:
             raise BadInputError(
                 f'parameter {self.name} is {excerpt(value)}: expected one of '
-                + ', '.join(self.choices))
+                + ', '.join(self.choices) + meant(value, self.choices))
         if isinstance(value, (int, float)) and not (
                 (self.minimum is None or value >= self.minimum)
                 and (self.maximum is None or value <= self.maximum)):

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from hmsa.errors import BadInputError, excerpt
+from hmsa.errors import BadInputError, excerpt, meant
 
 #: Formats of figures; ``pgf`` is for LaTeX.
 KINDS = ('png', 'pdf', 'svg', 'pgf')
@@ -52,7 +52,7 @@ class Paper:
             if name not in PANELS:
                 raise BadInputError(
                     f'the panel {excerpt(name)} is unknown: expected some of '
-                    f'{", ".join(PANELS)}')
+                    f'{", ".join(PANELS)}' + meant(name, PANELS))
 
     @property
     def inches(self) -> float:

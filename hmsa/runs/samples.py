@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from hmsa.errors import BadInputError
+from hmsa.errors import BadInputError, meant
 from hmsa.interfaces.parameters import JOINT
 from hmsa.model.units import NANOSECONDS
 
@@ -98,7 +98,8 @@ class SampleReader:
             return joint
         if required:
             raise BadInputError(
-                f'{where} has no joint {joint!r}: expected one of {", ".join(sorted(names))}')
+                f'{where} has no joint {joint!r}: expected one of {", ".join(sorted(names))}'
+                + meant(joint, names))
         if JOINT.default in names:
             return str(JOINT.default)
         if len(names) == 1:
