@@ -128,7 +128,7 @@ def _left(
     levels = get_shaper(shaper)(MoveRequest(
         State(rest), rest + move, planned.nondimensional)).levels
     faster = planned.time_unit / actual.time_unit
-    levels = tuple(replace(x, time=x.time * faster) for x in levels)
+    levels = tuple(x._replace(time=x.time * faster) for x in levels)
     end = levels[-1].time
     period = actual.period / actual.time_unit
     times = np.linspace(end, end + _PERIODS * period, _LOOK, dtype=np.float64)

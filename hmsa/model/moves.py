@@ -1,7 +1,8 @@
 """Records of a move: setpoint, state, level, command and the limits it keeps."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 import math
+from typing import NamedTuple
 
 from hmsa.errors import BadInputError
 from hmsa.model.laws.coordinate import DEFLECTION, STRETCH
@@ -53,16 +54,15 @@ class State:
         return self.load if self.amplifier is None else self.amplifier
 
 
-@dataclass(frozen=True)
-class Level:
+# As tuples, a level and a move are made in half the time, which counts in a plan of 10 us.
+class Level(NamedTuple):
     """A constant load beta from a time on, counted from the start of the move."""
 
     time: float
     load: float
 
 
-@dataclass(frozen=True)
-class Move:
+class Move(NamedTuple):
     """The command for one target."""
 
     code: Code
@@ -77,8 +77,8 @@ class Move:
         """Return the move without the levels from a time on."""
         # Times on a grid are rounded.
         levels = tuple(x for x in self.levels if x.time < (1.0 - 1e-12) * time)
-        return replace(
-            self, levels=levels,
+        return self._replace(
+            levels=levels,
             tail=self.tail[:max(len(self.tail) - len(self.levels) + len(levels), 0)])
 
 

@@ -160,8 +160,8 @@ def segments(
 def _cut(request: MoveRequest, move: Move, span: float, *, last: bool) -> Move:
     """Return a move that is cut at the end of its setpoint; the last one is completed."""
     units = request.units
-    return replace(
-        move if last else move.until(span), code=Code.SPELL_TOO_SHORT,
+    return (move if last else move.until(span))._replace(
+        code=Code.SPELL_TOO_SHORT,
         duration=move.duration if last else math.inf,
         reason=f'the duration {units.time_text(span)} ends before {request.named_target} is '
         f'reached, which takes {units.time_text(move.duration)}')
@@ -187,7 +187,7 @@ def _follow(request: MoveRequest, move: Move, span: float) -> State:
         place = bisect_right(move.levels, end, key=lambda x: x.time) - 1
         level = move.levels[place]
         return follow(
-            (replace(level, time=0.0),), move.tail[place - len(move.levels)], end - level.time,
+            (level._replace(time=0.0),), move.tail[place - len(move.levels)], end - level.time,
             material, delivery)
     parts, last = ramps(move.levels, start.ramps_from, end, delivery.slew)
     ramped = max(parts[-1][0], 0.0)

@@ -6,7 +6,6 @@ psi'(l_d) + sum h_i exp(-t/tau_i) for Maxwell branches, in steps (zero-order hol
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 import math
 
 import numpy as np
@@ -115,8 +114,8 @@ def held(request: MoveRequest, found: Move, span: float) -> Move:
     if found.code in _RINGING:
         rings = int(np.searchsorted(begins, begins[0] + longest_motion(holding, material)))
         states[:rings] = _passed(request, levels + tail[:rings], begins[:rings])
-    return replace(
-        found, levels=levels + tail, tail=tuple(states), vibration=_SURE * (vibration + more))
+    return found._replace(
+        levels=levels + tail, tail=tuple(states), vibration=_SURE * (vibration + more))
 
 
 def _passed(

@@ -208,7 +208,7 @@ def _designed(request: MoveRequest) -> Move:
         if found[0]:
             break
     if not found[1] < before - _NOTHING:
-        return replace(chain, reason=chain.reason or (
+        return chain._replace(reason=chain.reason or (
             f'no levels leave less than the cascade of order {request.order}, which is used'))
     return Move(Code.MINIMAX, found[0], chain.duration)
 
@@ -370,7 +370,7 @@ def _balance(request: MoveRequest, chain: Move, levels: Sequence[Level]) -> tupl
     """Return field and amplifier output at arrival, from which they follow the branches."""
     material = request.material
     followed = branches_of(
-        arrival(request, replace(chain, levels=tuple(levels))), request.material)
+        arrival(request, chain._replace(levels=tuple(levels))), request.material)
     holding = request.holding_load()
     above, ratios = holding - np.array(followed), material.branches[:, motion.RATIO]
     return holding + float(ratios @ above), holding + float(

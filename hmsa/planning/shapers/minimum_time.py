@@ -39,10 +39,10 @@ def minimum_time(request: MoveRequest) -> Move:
         raise refusals[0]
     fastest = min(found, key=lambda x: x.duration)
     if fastest.code is Code.TWO_STEP:
-        return replace(fastest, reason=(
+        return fastest._replace(reason=(
             'no full push and full brake within the limits are found that are sooner at rest at '
             f'{request.target:g} than the two-step command, which is used'))
     if refusals and math.isinf(fastest.duration):
-        return replace(
-            fastest, reason=f'{refusals[0]}: the unshaped step approaches without overshoot')
+        return fastest._replace(
+            reason=f'{refusals[0]}: the unshaped step approaches without overshoot')
     return fastest

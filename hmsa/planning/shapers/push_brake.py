@@ -64,7 +64,7 @@ def push_brake(request: MoveRequest) -> Move:
     if found is not None:
         return Move(Code.MINIMUM_TIME, *found)
     if lags:
-        return replace(free_levels(request), reason='')
+        return free_levels(request)._replace(reason='')
     raise RefusedError(
         Code.NOT_CONVERGED,
         f'no command of two levels within the limits was found from {request.named_state} to '

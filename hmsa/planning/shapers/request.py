@@ -150,7 +150,10 @@ class MoveRequest:
     def keeps(self, levels: Sequence[Level]) -> bool:
         """Return whether levels are inside the load limits."""
         least, most = self.limits.minimum, self.limits.maximum
-        return all(least <= x.load <= most for x in levels)
+        for _, load in levels:  # noqa: SIM110 - half the time of all()
+            if not least <= load <= most:
+                return False
+        return True
 
     def holding_load(self) -> float:
         """Return the load that holds the target, beta_1; `RefusedError` outside the limits."""

@@ -49,7 +49,7 @@ def robust(request: MoveRequest) -> Move:
             break
     if chain.code is Code.ROBUST and (request.material.creeps or not request.delivery.ideal):
         chain = _chain(request, [*waypoints, request.target])
-    return chain if chain.code is Code.ROBUST else replace(move, reason=(
+    return chain if chain.code is Code.ROBUST else move._replace(reason=(
         f'no cascade of order {request.order} leads to {request.named_target} ({chain.code}): '
         'a single two-step command is used'))
 

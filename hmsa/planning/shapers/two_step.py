@@ -65,17 +65,17 @@ def two_step(request: MoveRequest) -> Move:
     # On a command grid or with ramps, start without the lag, whose push needs another level.
     code, levels = _late(request, delivery.lag if at_once else 0.0) \
         if lags or creeps else _plain(request)
-    if code in _WITHOUT and not (lags and code is Code.HOLD):
-        return _without(request, code, holding)
     if code is Code.TWO_STEP:
         found = (levels, levels[-1].time) if at_once else _delivered(request, levels)
         if found is not None and request.keeps(found[0]):
             sooner = _sooner(request, found[1]) if lags or creeps else None
             return sooner or Move(Code.TWO_STEP, *found)
+    elif code in _WITHOUT and not (lags and code is Code.HOLD):
+        return _without(request, code, holding)
     if request.still and not lags and (code is Code.TWO_STEP or not creeps):
         request.check(levels)
     if at_once and not lags and not creeps:
-        return replace(push_brake(request), reason=no_single(request))
+        return push_brake(request)._replace(reason=no_single(request))
     try:
         return free_levels(request)
     except RefusedError:
