@@ -19,7 +19,7 @@ _MISTAKEN = (
 
 
 def advice_on(path: Path) -> str:
-    """Return what a file is in place of a bag and what to do; empty if it may be one."""
+    """Return the kind of a file given instead of a bag, and the remedy; empty if it may be one."""
     if not path.is_file():
         return ''
     with path.open('rb') as file:

@@ -126,7 +126,7 @@ def write(folder: Path, metadata: BagMetadata) -> None:
 
 
 def read(path: Path) -> BagMetadata:
-    """Read a file of version 1 to 9, with defaults for what it lacks, or raise `BagError`."""
+    """Read a file of version 1 to 9, with defaults for missing values, or raise `BagError`."""
     try:
         # In a foreign bag it may be a pipe, a device, or a link to one.
         if not path.is_file():

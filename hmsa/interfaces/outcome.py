@@ -78,7 +78,7 @@ class Outcome:
         return f'{which}: {self.ended.replace("_", " ") or "over"} before arrival'
 
     def to_texts(self) -> dict[str, str]:
-        """Return it as the values of a status, by key; what is not known is omitted."""
+        """Return the outcome as the values of a status, by key; unknown values are omitted."""
         asked = self.setpoint
         values: dict[str, object] = {
             'asked': self.asked, 'request': self.request, 'plan': self.plan,

@@ -305,7 +305,7 @@ class PlannedSegment:
 
     @property
     def told(self) -> str:
-        """How the move differs from the request, and what it leaves; empty if nothing is."""
+        """How the move differs from the request, and the vibration it leaves; empty if none."""
         left = '' if self.left is None else self.left.of(self.stretch, self.code)
         return '; '.join(filter(None, (self.reason, left)))
 

@@ -261,7 +261,7 @@ class _Collected:
                 sent, _LEVELS[min(level, 2)], values.get('code', ''), content.message)))
 
     def order(self) -> None:
-        """Sort what the planner published into the order of publishing."""
+        """Sort the messages of the planner by the order of publishing."""
         for kept in (self.plans, self.verdicts, self.outcomes):
             kept.sort(key=lambda x: x[0])
 
