@@ -192,27 +192,28 @@ def test_a_fault_after_a_healthy_move_leaves_what_that_move_confirmed():
     moves(it, MOVES[:2])
     it.sense = lambda time, x: [(time, x + 0.05)]
     assert np.max(np.abs(moves(it))) < 0.5
-    assert 'G about +10 %, bias of the sensor about 0.05; plans use it' in it.message
+    assert 'G about +10 %, bias of the sensor about 0.05; plans do not use it' in it.message
     assert 'plans keep the parameters that samples confirmed last' in it.message
 
 
-def drifting():
+def drifting(rate):
     begun = []
 
     def sense(time, stretch):
         begun.append(time)
-        return [(time, stretch + 1e-2 * (time - begun[0]) / 1e9)]
+        return [(time, stretch + rate * (time - begun[0]) / 1e9)]
     return sense
 
 
 CHANGES = {
     'scale 0.9': lambda: lambda time, x: [(time, 1.0 + 0.9 * (x - 1.0))],
     'scale 0.98': lambda: lambda time, x: [(time, 1.0 + 0.98 * (x - 1.0))],
-    'drift 1 % a second': drifting}
+    'offset 0.05': lambda: lambda time, x: [(time, x + 0.05)],
+    'drift 1 % a second': lambda: drifting(1e-2), 'drift 3 % a second': lambda: drifting(3e-2)}
 
 
-@pytest.mark.parametrize('change', CHANGES)
-@pytest.mark.parametrize('modulus', [1.0, 1.1])
+@pytest.mark.parametrize(('change', 'modulus'), [
+    (x, y) for x in CHANGES for y in (1.0, 1.1) if x not in ('offset 0.05', 'drift 3 % a second')])
 def test_a_sensor_that_changes_is_named_costs_nothing_and_is_forgotten(change, modulus):
     it = bench(False, noise=1e-3, factors={'shear_modulus': modulus})
     moves(it, (1.3, 1.15, 1.4))
@@ -234,13 +235,19 @@ def test_a_small_bias_that_jumps_and_stays_costs_nothing(modulus):
     assert np.max(np.abs(moves(it, (1.2, 1.35, 1.1, 1.3, 1.15, 1.4)))) < 0.5
 
 
-def test_what_a_sensor_showed_that_was_wrong_from_the_first_sample_ends_with_it():
+# The error that samples cannot avoid: they cannot tell a scale from another remanence, nor the
+# drift of a sensor from creep.
+@pytest.mark.parametrize(('change', 'most', 'after'), [
+    ('scale 0.9', 12.0, 2.0), ('scale 0.98', 2.5, 0.5), ('offset 0.05', 0.1, 0.1),
+    ('drift 3 % a second', 12.0, 1.5)])
+def test_what_a_sensor_showed_that_failed_in_the_first_move_ends_with_it(change, most, after):
     it = bench(False, noise=1e-3)
-    healthy, it.sense = it.sense, CHANGES['scale 0.9']()
-    # Samples cannot tell its scale from another remanence.
-    assert np.max(np.abs(moves(it, (1.3, 1.15))[:, 1])) > 5.0
+    healthy, it.sense = it.sense, CHANGES[change]()
+    assert np.max(np.abs(moves(it, (1.3, 1.15)))) < most
     it.sense = healthy
-    assert np.max(np.abs(moves(it, (1.35, 1.2, 1.3)))) < 2.0
+    left = np.abs(moves(it, (1.35, 1.2, 1.3)))
+    assert np.max(left[:, 1]) < 0.05
+    assert np.max(left) < after
     assert it.planner.model.actuator.remanence == pytest.approx(
         it.runtime.follower.joints['a'].given.actuator.remanence, rel=1e-3)
 

@@ -156,8 +156,7 @@ def test_what_changes_on_the_way_is_corrected_and_a_stop_comes_to_rest():
     run.go(10.0 / run.frequency)
     assert abs(run.kept(5, 6)[0]) > 0.03
     run.go(15.0 / run.frequency)
-    # A change of the sensor is not excluded at once.
-    assert np.abs(run.kept(13, 15)).max() < 5e-3
+    assert np.abs(run.kept(13, 15)).max() < 3e-3
     run.runtime.request(Stop())
     arrival = run.planner.plan.segments[-1].arrival
     run.go((arrival - run.begin) / SECOND + 0.05)

@@ -1,5 +1,6 @@
 """One joint under feedback: its estimate, and how plans use it."""
 
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field, InitVar, replace
 from functools import partial
@@ -31,7 +32,7 @@ from hmsa_lab.adapt.messages import differences, sentence
 from hmsa_lab.adapt.motion import held, rest
 from hmsa_lab.adapt.move_errors import MoveErrors, Moves
 from hmsa_lab.adapt.prior import Prior
-from hmsa_lab.adapt.trust import Trust
+from hmsa_lab.adapt.trust import shows_move, Trust
 from hmsa_ros.runtime.records import Settings
 
 # Earlier levels that still affect the samples: the field of a coil with lag depends on them.
@@ -56,11 +57,14 @@ _LOOK = 3.0
 # time scales and coil time constants, after a change or in all. A field that is measured some ms
 # before or after the stretch differs for that long at each change of level.
 _OFF, _LEAST, _FOLLOWED = 0.05, 0.01, 3.0
-# A sensor that had changed is as before again once its gain is known to better than this, and
-# differs by less plus half a standard deviation; its bias by less plus some standard deviations.
-_AGAIN, _ALIKE, _BIAS, _SURE = 8e-3, 2e-3, 2e-4, 3.0
+# A sensor that had changed is as before again once the standard deviation of its reading is below
+# the first value, and its change below a bias, a fraction of the stretch from rest, and some
+# standard deviations, up to the last value.
+_AGAIN, _BIAS, _ALIKE, _SURE, _MOST = 3e-3, 2e-4, 1e-3, 2.0, 1e-3
 # Log odds from which the sensor counts as changed.
 _JUMPED = 5.0
+# Number of samples kept to be explained anew.
+_KEPT = 600
 # Fraction by which the report of an applied level may be rounded.
 _ROUNDED = 0.01
 
@@ -107,14 +111,21 @@ class AdaptiveJoint:
     news: bool = False  # whether the latest estimate awaits comparison with the plan
     # Samples that arrived during an update: timestamp, stretch, and time of arrival.
     _waiting: list[tuple[int, float, int]] = field(default_factory=list)
+    # Samples in use, by arrival: timestamp and stretch.
+    _kept: deque[tuple[int, float]] = field(default_factory=lambda: deque(maxlen=_KEPT))
+    _fitted: int = 0  # time of the newest sample of the last update that fitted
+    _since: int = 0  # timestamp from which samples are explained
+    _anew: bool = False  # whether samples that have arrived before are explained anew
+    # Explanations of these samples that have been tried: whether the sensor has changed.
+    _tried: set[bool] = field(default_factory=set)
     _setpoint: tuple[int, int] = (0, -1)  # number of the plan, and place under way
     _sensor: tuple[StateEstimate, SensorModel] | None = None  # estimate, and its sensor
     _measured: bool = False  # whether the field is measured
     _differs: int | None = None  # timestamp since which the field differs; None if it does not
     sensor_changed: bool = False  # whether the estimator allows for any bias and gain
+    _changed: int = 0  # time at which a move has shown that it has; 0 if none has
     reverts: bool = False  # whether the plan is to be reverted to the given parameters
     _bias: tuple[float, float] = 0.0, 0.0  # of the sensor as confirmed, and its deviation
-    _as_given_tried: bool = False  # whether it last restarted with the sensor as given
     mismatch: int = 0  # longest time in ns for which it differed, and then not any more
 
     def __post_init__(self, begun: int) -> None:
@@ -154,10 +165,15 @@ class AdaptiveJoint:
         return self.settings.feedback_tolerance if self.settings.cautious else math.inf
 
     @property
-    def acting(self) -> StateEstimate | None:
-        """The latest estimate if it is to be used: a whole move has shown that it fits."""
+    def fitting(self) -> StateEstimate | None:
+        """The latest estimate if a whole move has shown that it fits."""
         latest = self.latest
         return latest if latest is not None and latest.trusted and self.trust.acts else None
+
+    @property
+    def acting(self) -> StateEstimate | None:
+        """The fitting estimate if it is to be used: not that of a sensor that has changed."""
+        return None if self.sensor_changed else self.fitting
 
     # -- samples -------------------------------------------------------------------------------
 
@@ -194,7 +210,7 @@ class AdaptiveJoint:
         lost = self.lost = self._off(stamp, flux_density)
         if lost and self.trust.why != lost and self.trust.doubt(lost, now, at_once=True):
             # The estimate is discarded, and the update under way ends.
-            self._restart()
+            self._restart(stamp + 1)
             self.latest, self.news = None, True
             self.looked()
         sample = stamp, math.nan if lost else stretch, now
@@ -215,8 +231,8 @@ class AdaptiveJoint:
     def _take(self, stamp: int, stretch: float, now: int) -> None:
         if self._is_ahead(stamp, now):
             self.estimator.screening.refuse_ahead((stamp - now) / NANOSECONDS)
-        else:
-            self.estimator.sample(stamp, stretch)
+        elif self.estimator.sample(stamp, stretch):
+            self._kept.append((stamp, stretch))
 
     def applied(self, stamp: int, flux_density: float) -> None:
         """Record that a level in T has taken effect, before the plan does."""
@@ -271,42 +287,70 @@ class AdaptiveJoint:
         screening, trust = estimator.screening, self.trust
         self._note_start(plan, now)
         trouble = screening.trouble if found is None else found.trouble
-        if found is not None and not trouble and found.jumped > _JUMPED:
+        jumped = found is not None and not trouble and found.jumped > _JUMPED
+        if jumped:
             trouble = 'samples fit better if the sensor has changed since the move before'
         if screening.lost > before and not trust.acts:
             # Later samples of the same update have fitted again.
             trouble = trouble or screening.last_trouble
+        if self._anew and found is not None and found.poor:
+            self._restart(self._since)
+            self.latest, self.news = None, True
+            return
+        if found is not None and found.poor and trust.acts:
+            trouble = trouble or 'samples fit worse than their noise'
+        self._anew &= found is None
         acted = trust.acts
-        if trust.doubt(trouble, now) if trouble else found is not None and trust.fits(
-                plan, self.unit, self.estimator, now):
-            self._restart()
+        if trust.doubt(
+                trouble, now, used=not self.sensor_changed, fitted=self._fitted > 0
+        ) if trouble else found is not None and trust.fits(plan, self.unit, estimator, now):
+            if acted:
+                self._tried.clear()
+            # Samples that an estimate in use has fitted do not show what has changed since.
+            self._restart(max(estimator.since, self._fitted) if acted and not jumped
+                          else estimator.since)
         elif found is not None and trust.acts and trust.failed:
             self._look_at_sensor(found, now, anew=not acted)
+        if not trouble:
+            self._fitted = self.newest
         if found is not None and not trust.why:
             self._look_at_vibration(plan, found)
         if found is not None and trust.why:
             found = replace(found, trusted=False, trouble=trust.why)
         self.latest, self.news = found, True
 
-    def _restart(self, *, healthy: bool = False) -> None:
+    def _restart(self, since: int, *, healthy: bool = False) -> None:
         """
-        Restart the estimator, in turn with the sensor as given and with one that has changed.
+        Restart the estimator with the samples kept from a time in ns on, and another explanation.
 
-        The former decides whether samples show the actuator as given. If not, the actuator stays
-        as samples confirmed it before, and a change of the sensor explains what it can. If
-        ``healthy``, the sensor is as given, and the actuator as confirmed.
+        With parameters learnt, the first one is the actuator and the sensor as given. The second
+        one is a sensor that has changed, and the actuator as moves have confirmed it. If both have
+        been tried with these samples, later ones are explained. If ``healthy``, the sensor is as
+        given, and the actuator as confirmed.
         """
-        model = self.trust.confirmed or self.given
-        changed = self.trust.failed and not self.sensor_changed and (
-            self._as_given_tried or not self._learnt)
-        self._as_given_tried = not changed
-        self.sensor_changed = changed and not healthy
-        self.estimator.restart(
-            self._as_identified(model) if healthy else
-            self.prior if not changed else Prior.of_changed_sensor(
+        model, screening = self.trust.confirmed or self.given, self.estimator.screening
+        ways = [False] * (self._learnt or not self.trust.failed) + [True] * self.trust.failed
+        left = [x for x in ways if x not in self._tried]
+        if healthy:
+            prior, self.sensor_changed = self._as_identified(model), False
+        else:
+            self.sensor_changed = (left or ways)[0]
+            prior = self.prior if not self.sensor_changed else Prior.of_changed_sensor(
                 model.actuator, self.settings.feedback_parameters, self._known,
-                others=model.others))
-        self.trust.restarted(self.estimator.screening.rejected)
+                others=model.others)
+        self._anew = healthy or bool(left)
+        self._changed = self._changed if self.sensor_changed else 0
+        if not self._anew:
+            self._tried.clear()
+            since = self.newest + 1
+        self._tried.add(self.sensor_changed)
+        self._since = since
+        # The level that has held the block may not have been the one commanded.
+        self.estimator.restart(prior, settled=not self._anew)
+        self.trust.restarted(screening.rejected, since)
+        for stamp, stretch in self._kept:
+            if stamp >= since:
+                self.fresh |= self.estimator.sample(stamp, stretch)
 
     def _look_at_sensor(self, found: StateEstimate, now: int, *, anew: bool) -> None:
         """Decide whether the sensor has changed, after an estimate that failed; ``anew``: fits."""
@@ -324,24 +368,30 @@ class AdaptiveJoint:
                 self.planner.take_model(self.given)
             elif anew:
                 trust.wait(now)
-                self._restart()
-        elif self._measures_as_before(found):
+                self._restart(self.estimator.since)
+        elif anew and not self._changed:
+            self._changed = now
+        elif shows_move(self.planner.plan, self._changed, self.unit, now) and (
+                self._measures_as_before(found)):
             trust.recover(given=False)
             # With that sensor, samples have confirmed what plans use.
             trust.confirmed = self.planner.model
-            self._restart(healthy=True)
             trust.wait(now)
+            self._restart(self.estimator.since, healthy=True)
 
     def _measures_as_before(self, found: StateEstimate) -> bool:
-        """Return whether gain and bias about rest of a sensor are as before a change."""
-        gain, bias = (found.free.index(x) for x in ('stretch_gain', 'stretch_bias'))
-        more = found.values['stretch_gain'] - self.prior.values['stretch_gain']
-        deviation = found.deviations['stretch_gain']
-        row = np.zeros(len(found.covariance))
-        row[bias], row[gain] = 1.0, found.values['stretch_gain'] * self.prior.coordinate.rest
-        return deviation < _AGAIN and abs(more) < _ALIKE + 0.5 * deviation and (
-            self._is_bias(found.values['stretch_bias'] + more * self.prior.coordinate.rest,
-                          math.sqrt(row @ found.covariance @ row)))
+        """Return whether a sensor reads the stretches of a move as before a change."""
+        places = [found.free.index(x) for x in ('stretch_bias', 'stretch_gain')]
+        rest, (bias, known) = self.prior.coordinate.rest, self._bias
+        gain, before = found.values['stretch_gain'], self.prior.values['stretch_gain']
+        for stretch in (self.start, found.stretch):
+            shift = found.values['stretch_bias'] - bias + (gain - before) * stretch
+            by = np.array([1.0, gain * stretch])
+            deviation = math.sqrt(float(by @ found.covariance[np.ix_(places, places)] @ by))
+            if deviation > _AGAIN or abs(shift) > _BIAS + _ALIKE * abs(stretch - rest) + min(
+                    _SURE * math.hypot(deviation, known), _MOST):
+                return False
+        return True
 
     @property
     def _learnt(self) -> bool:
@@ -361,7 +411,8 @@ class AdaptiveJoint:
         self.trust.confirm(model, self.ledger.left)
         found = self.acting
         if found is not None and not self.trust.failed:
-            self._bias = found.values['stretch_bias'], found.deviations.get('stretch_bias', 0.0)
+            place = found.free.index('stretch_bias')
+            self._bias = found.values['stretch_bias'], math.sqrt(found.covariance[place, place])
 
     def looked(self) -> None:
         """End the update under way, and add the samples that arrived during it."""
@@ -440,7 +491,7 @@ class AdaptiveJoint:
     @property
     def sensor(self) -> SensorModel:
         """The sensor as estimated; as given where there is no estimate."""
-        found = self.acting
+        found = self.fitting
         if found is None:
             return SensorModel()
         if self._sensor is None or self._sensor[0] is not found:
@@ -510,7 +561,8 @@ class AdaptiveJoint:
         plan = self.planner.plan
         place = plan.under_way(now)
         target = plan.segments[place].stretch if place >= 0 else self.start
-        use = 'plans use it' if trust.acts else 'plans use it after a move that samples fit'
+        use = 'plans do not use it' if self.sensor_changed else (
+            'plans use it' if trust.acts else 'plans use it after a move that samples fit')
         words = sentence(
             self.latest, self.prior.values, plan.level(now).flux_density, target,
             self.start, self.amplitude, use if self.adapts else '')

@@ -100,6 +100,7 @@ class StateEstimate:
     trusted: bool  # whether it may be used for plans
     trouble: str  # reason if not; else empty
     jumped: float  # log odds that the sensor has changed since the last move
+    poor: bool  # whether the newest samples fit worse than their noise
 
     @property
     def actuator(self) -> ActuatorParameters:
@@ -168,15 +169,20 @@ class Estimator:
         self.learning = self.options.learn
         # Covariance of the parameters while they are fixed.
         self._fixed: Array | None = None
+        self._settled = True  # whether a window may begin at equilibrium
         self._levels: list[tuple[int, float]] = []
         self._pending: list[tuple[int, float]] = []
         self._origin = 0
         self._window: Window | None = None
         self._solution: Solution | None = None
 
-    def restart(self, prior: Prior) -> None:
-        """Discard all estimates, and begin with a prior; counts and levels stay."""
-        self.prior = prior
+    def restart(self, prior: Prior, *, settled: bool = True) -> None:
+        """
+        Discard all estimates, and begin with a prior; counts and levels stay.
+
+        Unless ``settled``, a block that has rested need not be at the equilibrium of its level.
+        """
+        self.prior, self._settled = prior, settled
         self.screening.restart()
         self._pending.clear()
         self._fixed = self._window = self._solution = None
@@ -311,7 +317,7 @@ class Estimator:
         level = self._levels[bisect_right(self._levels, stamp, key=lambda x: x[0]) - 1][1]
         at = rest(prior.values, prior.free, level)
         stretch, frequency = at[:2] if at else (shown, 1.0 / prior.values['time_unit'])
-        rests = at is not None and self._unchanged(stamp, stamp, _SETTLED)
+        rests = at is not None and self._settled and self._unchanged(stamp, stamp, _SETTLED)
         off = _AT_REST if rests else _ANYWHERE
         covariance = np.zeros((len(mean) + 2, len(mean) + 2))
         covariance[:-2, :-2] = known
@@ -382,7 +388,7 @@ class Estimator:
         return StateEstimate(
             time, float(state[-2]), float(state[-1]), values, self.prior.free, deviations,
             covariance, off, found.instead, doubt, window.suspects.gain, self.noise,
-            not trouble, trouble, found.jumped)
+            not trouble, trouble, found.jumped, found.poor)
 
     def _strange(self, z: Array) -> str:
         """Return a message on implausible parameters that samples would need; else empty."""

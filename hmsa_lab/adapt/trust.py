@@ -37,15 +37,22 @@ class Trust:
         # Number of estimates that fitted a move and failed later; number of moves still to fit.
         self._failures, self._moves = 0, 1
 
-    def doubt(self, why: str, now: int, *, at_once: bool = False) -> bool:
-        """Record that samples do not fit at a time in ns; return whether to restart."""
+    def doubt(
+            self, why: str, now: int, *, used: bool = True, fitted: bool = False,
+            at_once: bool = False) -> bool:
+        """
+        Record that samples do not fit at a time in ns; return whether to restart.
+
+        An estimate that earlier samples ``fitted`` has failed. Those that acted are counted, if
+        plans ``used`` them.
+        """
         if self.ended:
             return False
         self.why = why
         self._doubts += 1
         if self.acts and self._doubts < _PERSISTENT and not at_once:
             return False
-        self._failures += self.acts
+        self._failures = max(self._failures + (self.acts and used), fitted)
         self.beginnings += 1
         self.acts, self._begin, self._doubts = False, now, 0
         # From the second failure on, each one doubles the number of moves that must fit.
@@ -54,15 +61,13 @@ class Trust:
 
     def fits(self, plan: Timeline, unit: float, estimator: Estimator, now: int) -> bool:
         """Record that samples fit at a time in ns; return whether to restart as too few did."""
-        # The time scale is in s.
         self._doubts = 0
         if self.ended:
             return False
         if not self.acts:
-            place = plan.place(self._begin) + 1
-            begin = plan.levels[place].stamp if place < len(plan.levels) else now
+            begin = _next_move(plan, self._begin, now)
             count, rejected = estimator.count_since(begin), estimator.screening.rejected
-            if begin + round(_SHOWN * unit * NANOSECONDS) <= now and count >= _FEWEST:
+            if shows_move(plan, self._begin, unit, now) and count >= _FEWEST:
                 many = rejected - self._rejected > max(_REJECTED * count, 1)
                 self._begin, self._rejected = now, rejected
                 if many:
@@ -78,9 +83,13 @@ class Trust:
         """Whether an estimate in use has failed to fit later samples."""
         return self._failures > 0
 
-    def restarted(self, rejected: int) -> None:
-        """Count rejected samples from this number on: earlier ones led to the restart."""
-        self._rejected = rejected
+    def restarted(self, rejected: int, begin: int) -> None:
+        """
+        Record that the estimator has restarted with the samples from a time in ns on.
+
+        Rejected samples count from this number on: earlier ones led to the restart.
+        """
+        self._rejected, self._begin = rejected, begin
 
     def wait(self, now: int) -> None:
         """Use the estimate after another move that fits."""
@@ -109,3 +118,17 @@ class Trust:
         """The parameters that plans use while samples do not fit, in words."""
         return 'the parameters given' if self.confirmed is None else (
             'the parameters that samples confirmed last')
+
+
+def shows_move(plan: Timeline, since: int, unit: float, now: int) -> bool:
+    """Return whether a move after a time in ns has lasted long enough, in time scales in s."""
+    return _next_move(plan, since, now) + round(_SHOWN * unit * NANOSECONDS) <= now
+
+
+def _next_move(plan: Timeline, since: int, now: int) -> int:
+    """Return the beginning of the first move after a time, or `now`, in ns; on a path, a level."""
+    place = plan.under_way(since)
+    if place >= 0 and plan.segments[place].path is not None:
+        place = plan.place(since) + 1
+        return plan.levels[place].stamp if place < len(plan.levels) else now
+    return next((x.begin for x in plan.segments if x.begin > since), now)

@@ -27,8 +27,9 @@ from hmsa_lab.adapt.motion import follow, Levels, ModelMotion, rest
 _PASSES, _HALVINGS, _SMALL = 4, 4, 0.1
 # Growth of the number of samples after which the suspects are examined again.
 _MORE = 1.3
-# Mean negative log probability of a sample above which a fit is poor; the usual value is 0.5.
-_POOR = 1.0
+# Mean negative log probability of a sample above which a fit is poor, its usual value, and the
+# number of standard deviations by which it surely differs from that.
+_POOR, _USUAL, _SURELY = 1.0, 0.5, 5.0
 # Standard deviations of a jump of the sensor, and its prior improbability as a logarithm.
 _JUMPS, _RARELY = {'stretch_bias': 0.05, GAIN: 0.1}, 3.0
 # Maximum change per step of a coordinate that is a logarithm.
@@ -83,6 +84,7 @@ class Solution:
     instead: Array
     doubt: BiasCase
     jumped: float = -math.inf  # log odds that the sensor jumped before the window
+    poor: bool = False  # whether the samples fit worse than their noise
 
     def at_end(self) -> tuple[Array, Array, Array, BiasCase]:
         """Return coordinates and state at the requested time, their covariance and `off`."""
@@ -177,6 +179,7 @@ class Window:
         shown = before * at.shown + float(weights @ self.stretch[:count]) / noise ** 2
         return replace(
             self, begin=begin, time=self.time[count:], stretch=self.stretch[count:], weighed=0,
+            first=False,
             rest=at._replace(
                 covariance=at.covariance + np.diag(drift[:-2]),
                 shown=shown / weight if weight else 0.0, weight=weight))
@@ -212,10 +215,12 @@ class Window:
                     self.suspected, self.others = before
             self.jumped = self._sensor_jumped(found)
         sure, off, square, instead = self.others
+        doubt = self._doubt(found)
         return Solution(
             found.z, found.here, sure * inverse(found.matrix, found.loose) + square,
-            np.broadcast_to(off, z.shape), np.broadcast_to(instead, z.shape), self._doubt(found),
-            self.jumped)
+            np.broadcast_to(off, z.shape), np.broadcast_to(instead, z.shape), doubt, self.jumped,
+            self._is_poor(found, noise, 0.5 * float(found.gradient @ doubt.off) + (
+                _SURELY * math.sqrt(0.5 * len(self.time)))))
 
     def _doubt(self, found: Optimum) -> BiasCase:
         """Return the expectation if a constant force and a gain may be in error, too."""
@@ -248,9 +253,14 @@ class Window:
             low[places], high[places] = -math.inf, math.inf
         return odds[1] - odds[0] - _RARELY
 
-    def _is_poor(self, found: Optimum, noise: float) -> bool:
-        """Return whether the estimated quantities explain the samples poorly."""
-        return loss(found.here.residual, noise, convex=True) > _POOR * len(self.time)
+    def _is_poor(self, found: Optimum, noise: float, more: float = 0.0) -> bool:
+        """
+        Return whether the estimated quantities explain the samples poorly.
+
+        ``more`` is the part that others may explain, and chance.
+        """
+        found_loss, count = loss(found.here.residual, noise, convex=True), len(self.time)
+        return found_loss > _POOR * count and found_loss > _USUAL * count + more
 
     def _look(
             self, found: Optimum, descend: Callable[[Array], Optimum | None]) -> Optimum:
