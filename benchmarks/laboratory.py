@@ -22,6 +22,10 @@ KINDS = {
     'modulus': 'G and damping', 'remanence': 'remanence', 'lag': 'lag of the coil',
     'stamps': 'late timestamps', 'gain': 'gain of the sensor', 'creep': 'creep',
     'force': 'constant force'}
+#: What may change in operation, by name.
+CHANGES = {
+    'bias': 'bias of the sensor', 'gain': 'gain of the sensor', 'force': 'constant force',
+    'modulus': 'G'}
 #: All groups drawn: no deviation, one, or several.
 GROUPS = {'none': 'nothing', **KINDS, 'several': 'several of these'}
 # Time scales that are integrated at once, and samples per time scale.
@@ -34,6 +38,23 @@ _LIKELY = 0.5
 _TARGETS = (1.08, 1.45)  # range of stretches
 _LEAST_STEP = 0.1
 _PAPER = paper_actuator()
+
+
+# Smallest and largest size of each of `CHANGES`, as that of the deviation, and the parts of a move
+# in which it comes: halfway to its arrival, halfway to its end, or before it.
+_SIZES = {
+    'bias': (1e-3, 5e-3), 'gain': (5e-3, 0.02), 'force': (2e-3, 0.01), 'modulus': (0.02, 0.1)}
+_PARTS = ('before', 'in', 'after')
+
+
+@dataclass(frozen=True)
+class Change:
+    """A sudden change of a laboratory."""
+
+    kind: str  # of `CHANGES`
+    size: float  # added to the bias, or to a force of 1 = G times the area; relative to others
+    move: int  # index of the move
+    part: str  # before it, in it, or after its arrival
 
 
 @dataclass(frozen=True)
@@ -58,6 +79,7 @@ class Bench:
     targets: tuple[float, ...]
     kinds: tuple[str, ...] = ()  # of `KINDS`: the deviations
     iron: 'Iron | None' = None  # the core of the coil
+    change: Change | None = None  # in operation
 
     @property
     def unit(self) -> float:
@@ -79,11 +101,28 @@ class Bench:
         found += [f'{name} {100.0 * x:+.1f} %' for name, x in (
             ('lag', self.lag / unit), ('stamps', self.late / unit), ('gain', self.gain - 1.0),
             ('creep', self.ratio), ('force', self.force * self.given.load_per_newton)) if x]
+        if self.change is not None:
+            found.append(f'{self.change.kind} changes by {100.0 * self.change.size:+.2g} % '
+                         f'{self.change.part} move {self.change.move + 1}')
         return ', '.join(found) or 'nothing'
 
+    def changed(self) -> 'Bench':
+        """Return the laboratory after its change."""
+        change = self.change
+        if change is None:
+            return self
+        if change.kind == 'modulus':
+            return replace(self, block=replace(
+                self.block, shear_modulus=(1.0 + change.size) * self.block.shear_modulus))
+        if change.kind == 'force':
+            return replace(self, force=self.force + change.size / self.given.load_per_newton)
+        if change.kind == 'gain':
+            return replace(self, gain=(1.0 + change.size) * self.gain)
+        return replace(self, bias=self.bias + change.size)
 
-def drawn(seed: int, targets: int = 3) -> Bench:
-    """Return the laboratory of a seed; groups alternate."""
+
+def drawn(seed: int, targets: int = 3, *, changes: bool = False) -> Bench:
+    """Return the laboratory of a seed; groups alternate, and with ``changes`` a third changes."""
     random = np.random.default_rng((27, seed))
     names = list(GROUPS)
     group = 'several' if seed % 2 else names[(seed // 2) % (len(names) - 1)]
@@ -126,7 +165,17 @@ def drawn(seed: int, targets: int = 3) -> Bench:
         max(delay * unit, late), gain if 'gain' in wrong else 1.0, bias,
         ratio if 'creep' in wrong else 0.0, relaxation * unit,
         force / given.load_per_newton if 'force' in wrong else 0.0, noise, unit / per_unit,
-        dropouts, tuple(stretches), tuple(x for x in KINDS if x in wrong))
+        dropouts, tuple(stretches), tuple(x for x in KINDS if x in wrong),
+        change=_change(seed, targets) if changes and seed % 3 == 2 else None)
+
+
+def _change(seed: int, targets: int) -> Change:
+    """Return the change of a seed, in its second move or later; kinds alternate."""
+    random = np.random.default_rng((30, seed))
+    kind = list(CHANGES)[seed // 3 % len(CHANGES)]
+    return Change(
+        kind, float(random.choice([-1.0, 1.0]) * random.uniform(*_SIZES[kind])),
+        int(random.integers(1, targets)), str(random.choice(_PARTS)))
 
 
 class Iron:
@@ -159,16 +208,7 @@ class Plant:
     """The actuator of a bench; times in ns, levels in T."""
 
     def __init__(self, bench: Bench, time: int) -> None:
-        block = bench.block
-        # Coefficients of Eq. 10 in SI units, divided by the area of the block.
-        inertia = block.density * block.half_length ** 2
-        self._stiffness = block.shear_modulus / inertia
-        self._drive = block.remanence / mu_0 / inertia
-        self._damping = block.damping_coefficient * block.half_thickness / (
-            8.0 * block.half_length ** 2) / inertia
-        self._limit = block.chain_limit
-        self._c1 = 2.0 * (block.half_thickness / block.half_length) ** 2
-        self._force = bench.force * block.load_per_newton * block.shear_modulus / inertia
+        self._set(bench)
         self._lag, self._ratio, self._relaxation = bench.lag, bench.ratio, bench.relaxation
         self._ahead = round(1e9 * _AHEAD * bench.unit)
         self.time = self._begin = self._since = self._until = time
@@ -184,6 +224,25 @@ class Plant:
             slope = (self._elastic(state + 1e-6) - self._elastic(state - 1e-6)) / 2e-6
             state -= (self._elastic(state) - self._force / self._stiffness) / slope
         self.state = np.array([state, 0.0, self._elastic(state)])  # at `_since`
+
+    def _set(self, bench: Bench) -> None:
+        """Take the coefficients of Eq. 10 in SI units, divided by the area of the block."""
+        block = bench.block
+        inertia = block.density * block.half_length ** 2
+        self._stiffness = block.shear_modulus / inertia
+        self._drive = block.remanence / mu_0 / inertia
+        self._damping = block.damping_coefficient * block.half_thickness / (
+            8.0 * block.half_length ** 2) / inertia
+        self._limit = block.chain_limit
+        self._c1 = 2.0 * (block.half_thickness / block.half_length) ** 2
+        self._force = bench.force * block.load_per_newton * block.shear_modulus / inertia
+
+    def change(self, bench: Bench) -> None:
+        """Go on with the block and the force of a bench, from the present state."""
+        if self._motion is not None:
+            self.state = self._motion(1e-9 * (self.time - self._since))
+        self._since, self._motion = self.time, None
+        self._set(bench)
 
     def command(self, stamp: int, level: float) -> None:
         """Set a level from a timestamp on; it replaces all at or after that time."""
@@ -271,6 +330,12 @@ class Device:
         """Time of the sensor's next event."""
         due = self._measured + self._period
         return min(due, self._wire[0][0]) if self._wire else due
+
+    def change(self) -> None:
+        """Change what changes in operation, now."""
+        self.bench = self.bench.changed()
+        self._go_on(self.time)
+        self.plant.change(self.bench)
 
     def receive(self, joint: int, stamp: int, level: float) -> None:
         """Set a level from a timestamp on."""

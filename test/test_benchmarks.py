@@ -22,7 +22,7 @@ from benchmarks import (
     contenders,
 )
 from benchmarks.bounds import bound
-from benchmarks.laboratory import Device, drawn, KINDS, Plant
+from benchmarks.laboratory import Change, Device, drawn, KINDS, Plant
 from benchmarks.measure import Contender, loosest, race, Report, Row, text_of_time
 from benchmarks.reference import Actuator, response, two_step
 from benchmarks.sheet import Sheet
@@ -168,6 +168,18 @@ def test_a_laboratory_is_the_same_for_the_same_seed_and_in_open_loop_leaves_what
     assert bench_harm.harm({'open loop': [exact], 'adapt': [weak]}, 'adapt') == [
         weak.size - exact.size]
     assert Device(bench, 0).next_sample > 0
+
+
+def test_a_laboratory_that_changes_leaves_as_much_as_its_change_from_then_on():
+    assert {drawn(x, 6, changes=True).change is None for x in (0, 1)} == {True}
+    # The sensor as it was at first decides what is left.
+    for kind, size, shown in (
+            ('modulus', 0.05, True), ('force', 0.02, True), ('bias', 0.02, False),
+            ('gain', 0.02, False)):
+        bench = replace(drawn(0), targets=(1.2, 1.4), change=Change(kind, size, 1, 'after'))
+        first, second = bench_harm.run(bench, 'open loop')
+        assert first.size < 1e-4
+        assert second.offset > 0.01 if shown else second.offset < 1e-4
 
 
 @pytest.mark.slow
