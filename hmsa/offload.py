@@ -1,4 +1,4 @@
-"""Execute work in another process, so that commands do not wait for it."""
+"""Execute work in other processes, so that commands do not wait for it."""
 
 from collections.abc import Callable, Generator, Iterator
 import os
@@ -51,51 +51,64 @@ def goes_on(work: Iterator[None]) -> bool:
     return next(work, work) is not work
 
 
+def at_once(doing: Doing) -> int:
+    """Return how many pieces of work are executed at a time."""
+    return doing.count if isinstance(doing, Offload) else 1
+
+
 class Offload:
     """
-    Execute work in a separate process, one piece after another.
+    Execute work in separate processes, each one piece after another.
 
-    The process starts with the first work, or by `start`. If it ends, work is executed `here` from
-    then on, and ``report`` is called with a message. It imports ``module`` before the first work.
+    They start with the first work, or by `start`. If one ends, work is executed `here` from then
+    on, and ``report`` is called with a message. They import ``module`` before the first work.
+    Their number is at most ``count``, and one for each core.
     """
 
-    def __init__(self, report: Callable[[str], None], module: str) -> None:
+    def __init__(self, report: Callable[[str], None], module: str, count: int = 1) -> None:
         self._report, self._module = report, module
-        self._worker: _Worker | None = None
+        self.count = max(min(count, len(os.sched_getaffinity(0))), 1)
+        self._workers: list[_Worker] = []
         self._lost = False
 
     def __call__(self, work: Callable[..., T], *arguments: object) -> Awaited[T]:
         """Return the result of work."""
         self.start()
-        if self._worker is not None:
-            try:
-                result: T = yield from self._worker.result(work, arguments)
-                return result
-            except (OSError, EOFError):
-                self._lose()
+        begun = monotonic_ns()
+        try:
+            while self._workers:
+                free = next((x for x in self._workers if not x.owes()), None)
+                if free is not None:
+                    result: T = yield from free.result(work, arguments)
+                    return result
+                if monotonic_ns() - begun > max(x.patience for x in self._workers):
+                    raise TimeoutError
+                yield
+        except (OSError, EOFError):
+            self._lose()
         return work(*arguments)
 
     def start(self) -> None:
-        """Start the process if it is not running."""
-        if self._worker is None and not self._lost:
-            try:
-                self._worker = _Worker(self._module)
-            except OSError:
-                self._lose()
+        """Start the processes if they are not running."""
+        try:
+            while len(self._workers) < self.count and not self._lost:
+                self._workers.append(_Worker(self._module))
+        except OSError:
+            self._lose()
 
     def _lose(self) -> None:
         self.close()
         if not self._lost:
             self._report(
-                'the process that estimates beside the planner has ended, does not answer, or '
+                'a process that estimates beside the planner has ended, does not answer, or '
                 'cannot start: the planner estimates itself, and commands may wait for that; see '
                 'what ended it (memory?), and start the planner again')
         self._lost = True
 
     def close(self) -> None:
-        """End the process immediately; further work starts another one."""
-        worker, self._worker = self._worker, None
-        if worker is not None:
+        """End the processes immediately; further work starts others."""
+        workers, self._workers = self._workers, []
+        for worker in workers:
             worker.end()
 
 
@@ -121,31 +134,35 @@ class _Worker:
         self._look.register(self._line, select.POLLIN)
         # List that receives the pending result; the first result signals that the worker is ready.
         self._owed: list[Any] | None = []
-        self._patience = _START
+        self._ready = False
+
+    @property
+    def patience(self) -> int:
+        """Longest wait in ns for the pending result."""
+        return _PATIENCE if self._ready else _START
 
     def result(self, work: object, arguments: object) -> Awaited[Any]:
         """
-        Return the result of work, after the results of earlier work.
+        Return the result of work, while no other is pending.
 
         Raises `OSError` or `EOFError` if no result will come, or none came in time.
         """
         begun = monotonic_ns()
         answer: list[Any] = []
+        self._owed = answer
+        self._line.send((work, arguments))
         while not answer:
-            if self._owes():
-                if monotonic_ns() - begun > self._patience:
+            if self.owes():
+                if monotonic_ns() - begun > self.patience:
                     raise TimeoutError
                 yield
-            elif not answer:
-                self._owed, begun = answer, monotonic_ns()
-                self._line.send((work, arguments))
         return answer[0]
 
-    def _owes(self) -> bool:
+    def owes(self) -> bool:
         """Receive a pending result if there is one; return whether one is still pending."""
         if self._owed is not None and self._look.poll(0):
             self._owed.append(self._line.recv())
-            self._owed, self._patience = None, _PATIENCE
+            self._owed, self._ready = None, True
         return self._owed is not None
 
     def end(self) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from hmsa.model.parameters import paper_actuator
-from hmsa.offload import finish, goes_on, here, Offload
+from hmsa.offload import at_once, finish, goes_on, here, Offload
 
 MS = 1_000_000
 
@@ -61,6 +61,26 @@ def test_each_gets_the_answer_to_what_it_asked_in_whatever_order_they_look(offlo
     assert not offload.told
 
 
+def test_two_processes_work_at_once_and_as_many_as_there_are_cores(tmp_path, monkeypatch):
+    monkeypatch.setattr('os.sched_getaffinity', lambda _: range(2))
+    offload, gate = Offload(print, 'test_offload', 3), tmp_path / 'gate'
+    os.mkfifo(gate)
+    try:
+        finish(offload(whose, 'ready'))
+        first = offload(whose, 1, gate)
+        # The second is done while the first waits for its gate.
+        assert goes_on(first)
+        (two, there) = finish(offload(whose, 2))
+        assert goes_on(first)
+        gate.write_text('')
+        (one, other) = finish(first)
+        assert (one, two) == (1, 2)
+        assert other != there
+        assert at_once(offload) == 2
+    finally:
+        offload.close()
+
+
 def test_a_process_that_ends_is_done_without_and_said_once(offload):
     assert finish(offload(ends, os.getpid())) == 'here'
     assert finish(offload(whose, 3)) == (3, os.getpid())
@@ -103,14 +123,14 @@ def test_it_ends_with_the_planner_however_that_ends_and_not_by_ctrl_c(tmp_path):
 def test_what_is_learnt_is_the_same_in_either_process(offload):
     sent = {}
     for name, doing in (('here', here), ('offload', offload)):
-        def at_once(work, *arguments, doing=doing):
+        def waited_for(work, *arguments, doing=doing):
             return finish(doing(work, *arguments))
             yield
 
         block = paper_actuator()
         stiffer = replace(block, shear_modulus=1.1 * block.shear_modulus)
         bench = Bench(Plant(stiffer), block, 1e-3, seed=1)
-        bench.runtime.follower.doing = at_once
+        bench.runtime.follower.doing = waited_for
         for target in (1.3, 1.1, 1.25):
             bench.move(target, 200 * MS)
         assert 'plans use it' in bench.message

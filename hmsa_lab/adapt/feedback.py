@@ -6,7 +6,7 @@ from typing import Any
 
 from hmsa.judge.records import SensorModel
 from hmsa.judge.setpoint_samples import SetpointSamples
-from hmsa.offload import ANSWER, Awaited, Doing, goes_on, here
+from hmsa.offload import ANSWER, at_once, Awaited, Doing, goes_on, here
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Believed
 from hmsa.planning.timeline import JointModel
@@ -185,7 +185,8 @@ class Feedback(Follower):
         Return whether this took long.
         """
         busy = False
-        # An update under way ends before another begins, first for the joint that waited longest.
+        looking = sum(x.looking is not None for x in self.joints.values())
+        # Updates under way end before others begin, first for the joint that waited longest.
         for joint in sorted(
                 self.joints.values(), key=lambda x: (x.looking is None, x.next_look)):
             if joint.choosing is not None:
@@ -199,10 +200,11 @@ class Feedback(Follower):
                     continue
                 joint.auditing, joint.ready = None, joint.ready - 1
             elif joint.looking is not None:
-                return self._look(joint, joint.looking, now) or busy
+                busy |= self._look(joint, joint.looking, now)
+                continue
             elif joint.audits and not joint.fresh:
                 joint.ready = len(joint.audits)
-            elif joint.fresh and now >= joint.next_look:
+            elif joint.fresh and now >= joint.next_look and looking < at_once(self.doing):
                 joint.looking, joint.spent = joint.update(now, self.doing), 0
                 self._look(joint, joint.looking, now)
             else:

@@ -70,7 +70,8 @@ class PlannerNode(ManagedNode):
         self._settings = declare_joints(self, PARAMETERS, OWN)
         self._worker = PlanningThread()
         self._offload = Offload(
-            self.get_logger().warning, registered(FOLLOWER)['adapt'].module)
+            self.get_logger().warning, registered(FOLLOWER)['adapt'].module,
+            len(self._settings.names))
         # The executor would store an event for each message on /clock, without limit if the node
         # cannot keep up. This subscription, read by `now`, only keeps the newest. It is unsuitable
         # for a node that must process commands before the time published after them.
