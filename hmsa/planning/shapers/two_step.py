@@ -224,12 +224,12 @@ def _pushed(first: Level, push: Level, last: float, slew: float, lag: float) -> 
 
 
 def _held(request: MoveRequest) -> Iterator[tuple[float, Template]]:
-    """Yield guesses of a level between ramps and its hold, with their durations."""
+    """Return guesses of a level between ramps and its hold, with their durations."""
     delivery, start, holding = request.delivery, request.load, request.holding_load()
     slew, eighth = delivery.slew, 0.25 * math.pi / request.frequency
     if delivery.lag > 0.0 or delivery.period > 0.0 or math.isinf(slew) or abs(
             holding - start) > _MOST_HALF_PERIODS * 4.0 * eighth * slew:
-        return
+        return iter(())
     reach = 8.0 * eighth * slew
     low = max(request.limits.minimum, min(start, holding) - reach)
     high = min(request.limits.maximum, max(start, holding) + reach)
@@ -240,4 +240,4 @@ def _held(request: MoveRequest) -> Iterator[tuple[float, Template]]:
         return until + abs(holding - level) / slew, Template.of(
             (Level(0.0, level), Level(until, holding)), [('load', 0), ('time', 1)])
 
-    yield from starmap(guess, product(range(_LONGEST_HOLD), _HEIGHTS))
+    return starmap(guess, product(range(_LONGEST_HOLD), _HEIGHTS))
