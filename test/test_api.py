@@ -412,7 +412,7 @@ def test_a_notebook_shows_tables_and_pictures(block, tmp_path):
         'a<b (T)  what', '───────  ────', '   1.00  x', '      –  y', 'c', 'note: n']
     # As a prompt without HTML shows them.
     assert repr(table) == str(table)
-    assert repr(plan) == '<Plan two_step: 1 setpoints, 2 levels in 0.00165067 s>'
+    assert repr(plan) == '<Plan two_step: 1 setpoint, 2 levels in 0.00165067 s>'
     assert repr(block) == (
         '<Actuator gent: 10 x 10 mm, shear modulus 30 kPa, 309.8 Hz, damping ratio 0.0408>')
 

@@ -337,7 +337,7 @@ def _thermal_values(thermal: Any) -> dict[str, Any]:
     """Return the parameters ``thermal.*`` of values by name."""
     known = {x.name.partition('.')[2]: x for x in THERMAL}
     values = {}
-    for name, value in mapping_of(thermal, 'thermal', "'remanence': -1e-3").items():
+    for name, value in mapping_of(thermal, 'thermal coefficients', "'remanence': -1e-3").items():
         if name not in known:
             raise BadInputError(
                 f'thermal has {excerpt(name)}: expected some of {", ".join(known)}'

@@ -313,8 +313,9 @@ class Plan:
         return hash(self._values())
 
     def __repr__(self) -> str:
-        return (f'<Plan {self.shaper}: {len(self.segments)} setpoints, {len(self.levels)} levels '
-                f'in {self.times[-1]:.6g} s>')
+        count = len(self.segments)
+        return (f'<Plan {self.shaper}: {count} setpoint{"s" * (count != 1)}, {len(self.levels)} '
+                f'levels in {self.times[-1]:.6g} s>')
 
     def _repr_html_(self) -> str:
         return self.report()._repr_html_()
