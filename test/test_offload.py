@@ -88,11 +88,11 @@ def test_a_process_that_ends_is_done_without_and_said_once(offload):
     assert 'the planner estimates itself' in words
 
 
-def test_a_process_that_does_not_answer_is_done_without(offload):
+def test_a_process_that_does_not_answer_is_done_without(offload, monkeypatch):
     _, process = finish(offload(whose, 1))
     assert process != os.getpid()
     os.kill(process, signal.SIGSTOP)
-    offload._worker._patience = 0
+    monkeypatch.setattr('hmsa.offload._PATIENCE', 0)
     assert finish(offload(whose, 2)) == (2, os.getpid())
     assert 'does not answer' in offload.told[0]
 
