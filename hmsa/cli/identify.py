@@ -40,19 +40,19 @@ def add_parser(subparsers: Any) -> None:
          'parameter file with the known values, such as geometry and density'),
         ('--free', 'NAME,...', str,
          'parameters to identify (default shear_modulus, damping_coefficient, chain_limit, '
-         'remanence, stretch_bias); +NAME adds to these, and --free=-NAME removes one; '
-         'others: density, time_unit, stretch_gain, sensor_latency, '
-         'coil_time_constant, constant_force, initial_stretch, initial_rate; modes for as many '
-         'secondary modes as the recording shows, with mass_factor in place of shear_modulus; '
-         'viscoelastic_ratio, viscoelastic_time and viscoelastic_exponent (further branches with '
-         '_2 and _3); constants of a hyperelastic model, such as law.c10 and law.c01',
+         'remanence, stretch_bias). +NAME adds to these, and --free=-NAME removes one. Others are '
+         'density, time_unit, stretch_gain, sensor_latency, coil_time_constant, constant_force, '
+         'initial_stretch, initial_rate, viscoelastic_ratio, viscoelastic_time and '
+         'viscoelastic_exponent (further branches with _2 and _3), and constants of a '
+         'hyperelastic model, such as law.c10. "modes" frees as many secondary modes as the '
+         'recording shows, with mass_factor in place of shear_modulus',
          {'default': ''}),
         ('--known', 'NAME=VALUE[+-STD],...', str,
          'fixed values, such as sensor_latency=2ms or half_length=5mm+-1%%; the intervals include '
          'the effect of a standard deviation', {'default': ''}),
         temperature_option(
-            'temperature of the actuator in the recording in degrees Celsius (default: as '
-            'recorded); the file holds there (thermal.reference)'),
+            'temperature of the actuator in the recording in degrees Celsius, for which the file '
+            'is then valid (thermal.reference; default: as recorded)'),
         ('--joint', 'NAME', str, 'joint to identify, if the bag has several', {'default': ''}),
         ('--profile', 'NAME', str, 'also print the profile likelihood of this parameter',
          {'default': ''}),
