@@ -7,6 +7,7 @@ from typing import Any, TYPE_CHECKING
 
 from hmsa.interfaces.parameters import (
     ACTUATOR_FIELDS,
+    BULK_RATIO,
     LAW,
     LAW_NAME,
     MODES,
@@ -57,7 +58,7 @@ def actuator_from(
             {**{x.name: x.default for x in LAW}, **values})
         if modulus is not None:
             numbers['shear_modulus'] = modulus
-    continuum = {x.name: values.get(x.name, x.default) for x in MODES}
+    continuum = {x.name: values.get(x.name, x.default) for x in (BULK_RATIO, *MODES)}
     modes = Modes(*(tuple(continuum.pop(f'modes.{x}')) for x in (
         'frequency_ratio', 'share', 'damping_ratio', 'ratio_exponent', 'share_exponent')))
     return ActuatorParameters(
@@ -115,6 +116,8 @@ def parameters_of(actuator: ActuatorParameters) -> dict[str, Any]:
     # What is as in the paper's model is not said.
     values |= actuator.modes.parameters | actuator.thermal.parameters | {
         f'actuator.{name}': value for name, value in actuator.factors.items() if value != 1.0}
+    if math.isfinite(actuator.bulk_ratio):
+        values[BULK_RATIO.name] = actuator.bulk_ratio
     if actuator.law is None:
         return values
     units = {x.name: x.unit for x in LAWS[actuator.law.law].constants}

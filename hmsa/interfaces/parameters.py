@@ -226,6 +226,12 @@ def present_name(name: str) -> str:
 #: Constants of laws that are only read at startup.
 FIXED = frozenset(x.name for law in LAWS.values() for x in law.constants if x.fixed)
 
+#: Compressibility of a block.
+BULK_RATIO = ParameterSpec(
+    'actuator.bulk_ratio', math.inf,
+    "Bulk over shear modulus of a compressible block, 1 to 1e6; .inf, as in the paper's model, "
+    'for constant volume.', '', 1.0, math.inf)
+
 #: Factors on the inertia, and secondary modes: what makes the block a continuum.
 MODES = (
     ParameterSpec(
@@ -296,7 +302,7 @@ THERMAL = (
 )
 
 #: All parameters of a block.
-BLOCK = (*ACTUATOR, *LAW, *MODES, *THERMAL)
+BLOCK = (*ACTUATOR, *LAW, BULK_RATIO, *MODES, *THERMAL)
 
 JOINT = ParameterSpec(
     'joint', 'actuator', 'Name of the joint in trajectories and joint states.')

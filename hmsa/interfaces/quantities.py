@@ -15,6 +15,7 @@ from hmsa.errors import BadInputError
 from hmsa.interfaces.parameters import (
     ACTUATOR,
     ACTUATOR_FIELDS,
+    BULK_RATIO,
     FLUX_DENSITY_MAX,
     FLUX_DENSITY_MIN,
     ParameterSpec,
@@ -169,6 +170,9 @@ QUANTITIES: tuple[GivenNumber, ...] = (
         'Gent limiting extensibility J_lim', (0.5, 200.0),
         'Gent, Rubber Chem. Technol. 69 (1996) 59, fits rubber with some 30 to 100; the paper '
         'takes 1 to 5'),
+    GivenNumber.of(
+        'bulk_ratio', BULK_RATIO, 'bulk over shear modulus of a compressible block, 1 to 1e6',
+        (3.0, math.inf), 'from porous silicones to rubber, which has some 1000'),
     GivenNumber(
         'zeta', '', 'damping zeta, c/(8 L H sqrt(rho G))', '', ZETA, 0.0, 1e12, (0.005, 2.0),
         'where the paper takes 0.02 to 1.1'),
@@ -219,7 +223,7 @@ DAMPING = GivenNumber.of(
     'damping', _BLOCK['damping_coefficient'], 'damping coefficient c', (0.0, math.inf), '',
     follows=True)
 #: Quantities with a default; all others are given, or set by --yes.
-OPTIONAL = ('flux_min', 'slew_limit')
+OPTIONAL = ('bulk_ratio', 'flux_min', 'slew_limit')
 
 
 def default_of(quantity: GivenNumber, given: Mapping[str, float]) -> float:

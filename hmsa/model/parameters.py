@@ -19,8 +19,8 @@ from hmsa.model.thermal import BLOCK_COEFFICIENTS, checked_temperature, Thermal
 from hmsa.model.units import MU_0, Units
 
 _ZERO_ALLOWED = ('zeta', 'damping_coefficient')
-# Infinite for neo-Hookean.
-_INFINITE_ALLOWED = ('j_lim', 'chain_limit')
+# Infinite for neo-Hookean, and for a block of constant volume.
+_INFINITE_ALLOWED = ('j_lim', 'chain_limit', 'bulk_ratio')
 _NO_NUMBERS = ('law', 'creep', 'modes', 'thermal')
 # Factors on the mass, which no recording of one mode can tell from other values.
 _FACTORS = ('mass_factor', 'transverse_mass_factor')
@@ -168,6 +168,8 @@ class NondimensionalParameters:
             return ''
         kind = self.coordinate.name
         whose = f'J_lim {self.j_lim:g}' if self.law is None else f'law {self.law.law}'
+        if self.law is not None and math.isfinite(self.law.bulk_ratio):
+            whose += f' with bulk_ratio {self.law.bulk_ratio:g}'
         # Parameter names stay unchanged.
         called = re.sub(r'\bstretch\b', kind, name)
         return (f'{called} is {stretch:g}: expected a {kind} between the limits {lower:.4f} and '
@@ -188,6 +190,7 @@ class Geometry:
     law: Elastic | None = None
     mass_factor: float = 1.0
     transverse_mass_factor: float = 1.0
+    bulk_ratio: float = math.inf
 
     @property
     def c1(self) -> float:
@@ -203,8 +206,16 @@ class Geometry:
     @property
     def inertia(self) -> float:
         """Factor on the density, for the mass factors: m(1) is `mass_factor` of the model's."""
-        more = self.transverse_mass_factor
-        return self.mass_factor * (more * (1.0 + self.c1) / (more + self.c1))
+        more, across = self.transverse_mass_factor, self.transverse
+        return self.mass_factor * (
+            more * (across + self.c1) / (more * across + self.c1))
+
+    @property
+    def transverse(self) -> float:
+        """Transverse inertia at rest over that of constant volume, 4 nu^2, nu Poisson's ratio."""
+        if math.isinf(self.bulk_ratio):
+            return 1.0
+        return ((3.0 * self.bulk_ratio - 2.0) / (3.0 * self.bulk_ratio + 1.0)) ** 2
 
     @property
     def loaded(self) -> float:
@@ -260,6 +271,9 @@ class ActuatorParameters:
         the same inertia at rest; default 1.
     thermal : Thermal
         Temperature coefficients, and the reference at which the values hold; default none.
+    bulk_ratio : float
+        Bulk over shear modulus of a compressible block, 1 to 1e6; default infinite, for constant
+        volume.
 
     Raises
     ------
@@ -281,12 +295,13 @@ class ActuatorParameters:
     mass_factor: float = 1.0
     transverse_mass_factor: float = 1.0
     thermal: Thermal = Thermal()
+    bulk_ratio: float = math.inf
 
     def __post_init__(self) -> None:
         """Check the values, and that they give usable scales."""
         _check(self)
         try:
-            scales = self.time_unit, self.flux_density_unit, self.nondimensional.c1
+            scales = self.time_unit, self.flux_density_unit, self.geometry.inertia_c1
         except ArithmeticError:
             scales = math.nan, math.nan, math.nan
         if not all(_SMALLEST < x < 1.0 / _SMALLEST for x in scales):
@@ -298,6 +313,10 @@ class ActuatorParameters:
             raise BadInputError(
                 f'transverse_mass_factor is {self.transverse_mass_factor:g}: expected 1 for a '
                 'beam, which has no transverse inertia of its own')
+        if math.isfinite(self.bulk_ratio):
+            from hmsa.model.compressible import check  # as below
+
+            check(self.bulk_ratio, self.law)
         for name, exponents in (
                 ('ratio', self.modes.exponents), ('share', self.modes.share_exponents)):
             if any(exponents) and self.rest == 0.0:
@@ -334,9 +353,13 @@ class ActuatorParameters:
         # Checked before the square root, which a negative product does not have.
         cube = cls(shear_modulus, density, half_length, half_length, remanence,
                    material.j_lim, 0.0)
+        law = material.law
+        bulk_ratio = math.inf if law is None else law.bulk_ratio
+        if law is not None and math.isfinite(bulk_ratio):
+            law = law.isochoric
         made = replace(
-            cube, half_thickness=half_length * math.sqrt(material.c1 / 2.0), law=material.law,
-            modes=material.modes,
+            cube, half_thickness=half_length * math.sqrt(material.c1 / 2.0), law=law,
+            modes=material.modes, bulk_ratio=bulk_ratio,
             creep=replace(material.creep, times=tuple(
                 x * cube.time_unit for x in material.creep.times)))
         return replace(made, damping_coefficient=material.zeta * made.damping_unit)
@@ -361,7 +384,7 @@ class ActuatorParameters:
         """All numeric values, by name."""
         return {
             x.name: getattr(self, x.name) for x in fields(self)
-            if x.name not in (*_NO_NUMBERS, *_FACTORS)}
+            if x.name not in (*_NO_NUMBERS, *_FACTORS, 'bulk_ratio')}
 
     @property
     def factors(self) -> dict[str, float]:
@@ -381,7 +404,9 @@ class ActuatorParameters:
     @property
     def geometry(self) -> Geometry:
         """Geometric factors from sizes and model."""
-        return Geometry(self.half_length, self.half_thickness, self.law, **self.factors)
+        return Geometry(
+            self.half_length, self.half_thickness, self.law, bulk_ratio=self.bulk_ratio,
+            **self.factors)
 
     @property
     def time_unit(self) -> float:
@@ -418,6 +443,21 @@ class ActuatorParameters:
         """Load of a force of 1 N on both faces of a block, or on the tip of a beam."""
         return 1.0 / (self.geometry.loaded * self.shear_modulus)
 
+    def side(self, stretch: float) -> float:
+        """Return the transverse stretch of a block at rest under a stretch."""
+        from hmsa.model.compressible import side  # as above
+
+        return side(stretch, self.law, self.chain_limit, self.bulk_ratio)
+
+    @cached_property
+    def energy(self) -> Elastic | None:
+        """Elastic energy in units of G, with the change of volume if there is one."""
+        if math.isinf(self.bulk_ratio):
+            return self.law
+        from hmsa.model.compressible import condensed  # as above
+
+        return condensed(self.law, self.chain_limit, self.bulk_ratio)
+
     @cached_property
     def nondimensional(self) -> NondimensionalParameters:
         """The dimensionless group of Eq. 11."""
@@ -425,7 +465,7 @@ class ActuatorParameters:
             zeta=self.damping_coefficient / self.damping_unit,
             j_lim=self.chain_limit,
             c1=self.geometry.inertia_c1,
-            law=self.law,
+            law=self.energy,
             creep=replace(self.creep, times=tuple(x / self.time_unit for x in self.creep.times)),
             modes=self.modes)
 

@@ -5,10 +5,11 @@ Each joint has a separate namespace with fixed identifiers, so that a message re
 one. The plant shows the present state, the planner the targets. Both use the same layout: rows
 along x, a new row along y after `ROW` joints, the origin in the middle.
 
-The volume of a block is constant. Along the field, which is z, it measures 2 H times the stretch;
-across the field, 2 L over the square root of the stretch. The magnetisation moves with the
-material, so that the remanence of the deformed block is Br times the stretch. Remanence and
-applied field are arrows of the same scale: length H for a flux density of Br, upwards if positive.
+Along the field, which is z, a block measures 2 H times the stretch; across the field, 2 L times
+the transverse stretch at rest, one over the square root of the stretch at constant volume.
+The magnetisation moves with the material, so that the remanence of the deformed block is Br times
+the stretch. Remanence and applied field are arrows of the same scale: length H for a flux density
+of Br, upwards if positive.
 
 A beam lies along x, is clamped at the end of smaller x, and bends towards z. The arrow of its
 magnetisation lies along its middle and is half as long as the beam. The arrow of the field is as
@@ -31,7 +32,9 @@ from hmsa.errors import BadInputError
 from hmsa.interfaces import topics
 from hmsa.interfaces.actuator import actuator_from
 from hmsa.interfaces.parameters import ParameterSpec
+from hmsa.model import compressible
 from hmsa.model.laws.bending import centreline, tangent
+from hmsa.model.laws.record import Elastic
 from hmsa.model.parameters import ActuatorParameters
 from hmsa.model.units import NANOSECONDS
 from hmsa_ros.nodes import ros_entities
@@ -80,6 +83,10 @@ class MarkerBlock:
     remanence: float  #: Br in T, greater than 0
     per_tesla: float = 1.0  #: arrow length of the field in m/T
     width: float = 0.0  #: width of a beam in m; 0 for a block
+    #: Elastic energy of a block, whose volume is constant if the last is infinite.
+    law: Elastic | None = None
+    chain_limit: float = math.inf
+    bulk_ratio: float = math.inf
 
     def __post_init__(self) -> None:
         if not self.joint:
@@ -94,7 +101,8 @@ class MarkerBlock:
             joint, length, thickness, actuator.remanence,
             per_tesla=2.0 * length / (3.0 * actuator.flux_density_unit)
             if section else thickness / actuator.remanence,
-            width=2.0 * section * length ** 2 / thickness)
+            width=2.0 * section * length ** 2 / thickness,
+            law=actuator.law, chain_limit=actuator.chain_limit, bulk_ratio=actuator.bulk_ratio)
 
     def bent(self, deflection: float) -> list[tuple[float, float, float]]:
         """
@@ -121,8 +129,9 @@ class MarkerBlock:
         return points
 
     def size(self, stretch: float) -> tuple[float, float, float]:
-        """Return 2 l, 2 l and 2 h in m at a stretch; the volume is constant."""
-        side = 2.0 * self.half_length / math.sqrt(stretch)
+        """Return 2 l, 2 l and 2 h in m at a stretch."""
+        side = 2.0 * self.half_length * compressible.side(
+            stretch, self.law, self.chain_limit, self.bulk_ratio)
         return side, side, 2.0 * self.half_thickness * stretch
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+import math
 from typing import Any
 
 from hmsa.errors import BadInputError, excerpt
@@ -17,6 +18,7 @@ ARRUDA_BOYCE = 6.0  # mu, lambda_m
 ELASTICA = 7.0  # result of `hmsa.model.laws.elastica.packed`
 NONAFFINE = 8.0  # gc, ge, lambda_m
 EXTENDED_TUBE = 9.0  # gc, ge, delta, beta
+CONDENSED = 10.0  # result of `hmsa.model.compressible.condensed`
 #: Families whose coordinate is the deflection of a tip.
 BEAMS = (BEAM, ELASTICA)
 
@@ -58,6 +60,10 @@ class Elastic:
     limits: tuple[float, float] = ENDLESS  #: range in which the energy is known
     shape: float | None = None  #: c1, if not that of a block
     section: float = 0.0  #: width times thickness of a beam over its length squared; 0 for a block
+    #: Bulk over shear modulus; infinite for a block of constant volume.
+    bulk_ratio: float = math.inf
+    #: What a compressible block has at constant volume; None for Gent.
+    isochoric: 'Elastic | None' = None
 
     @property
     def rest(self) -> float:

@@ -11,7 +11,7 @@ namespace hmsa {
 enum Place { kind_at, zeta_at, c1_at, damping_at, lower_at, upper_at, constants_at };
 enum Family {
     gent, neo_hookean, polynomial, ogden, table, beam, arruda_boyce, elastica, nonaffine,
-    extended_tube
+    extended_tube, condensed
 };
 
 // Functions of the stretch alone are differentiated by it, and then by the chain rule, unless the
@@ -158,6 +158,48 @@ struct Beam {
     }
 };
 
+// A compressible block whose transverse stretch is in equilibrium: pieces of the force and of six
+// times the transverse inertia, about their middles (hmsa/model/compressible.py).
+struct Condensed {
+    static constexpr int degree = 9, width = 3 + 2 * (degree + 1);
+    const double *c;
+
+    const double *piece(double l) const  // null outside the table
+    {
+        const double *first = c + 2;
+        if (!(*first <= l && l <= c[1]))
+            return nullptr;
+        int low = 0, high = int(c[0]);
+        while (high - low > 1) {
+            const int middle = (low + high) / 2;
+            (l < first[width * middle] ? high : low) = middle;
+        }
+        return first + width * low;
+    }
+    template <class S> HMSA_INLINE S force(const S &l) const
+    {
+        const double *p = piece(value(l));
+        return p ? horner<degree>(p + 3, S(l - p[1])) : S(l * __builtin_nan(""));
+    }
+    // 1/m and m'/(2 m).
+    template <class S> void inertia(const S &l, double c1, S &i_mass, S &falls) const
+    {
+        const double *p = piece(value(l));
+        if (!p) {
+            i_mass = falls = l * __builtin_nan("");
+            return;
+        }
+        const S u = l - p[1];
+        i_mass = 6.0 * inverse(S(horner<degree>(p + 4 + degree, u) + c1));
+        falls = horner_slope<degree>(p + 4 + degree, u) * i_mass * (1. / 12);
+    }
+    double energy(double l) const
+    {
+        const double *p = piece(l);
+        return p ? energy_within<degree>(p + 1, l - p[1]) : __builtin_nan("");
+    }
+};
+
 // An actuator of any model except Gent, chosen at run time: its steps make calls, those of Gent do
 // not. C is the type of the constants.
 template <class C> struct AnyOf {
@@ -170,6 +212,7 @@ template <class C> struct AnyOf {
     Network<C> network_law;
     Table<double> table_law;
     Beam beam_law;
+    Condensed condensed_law;
 
     void read(int, const double *m)
     {
@@ -182,6 +225,7 @@ template <class C> struct AnyOf {
         case nonaffine:
         case extended_tube: return network_law.read(kind == extended_tube, m + constants_at);
         case table: return table_law.read(0, m + constants_at);
+        case condensed: condensed_law = {m + constants_at}; return;
         default:
             beam_law = {drag, m + constants_at, kind == beam ? Beam::one_mode : Beam::two_modes};
         }
@@ -205,6 +249,7 @@ template <class C> struct AnyOf {
         case nonaffine:
         case extended_tube: return f(network_law);
         case table: return f(table_law);
+        case condensed: return f(condensed_law);
         default: return f(beam_law);
         }
     }
@@ -221,6 +266,11 @@ template <class C> struct AnyOf {
     {
         if (rest == 0)
             return beam_law.inertia(l, i_mass, falls, damps);
+        if (kind == condensed) {
+            condensed_law.inertia(l, c1, i_mass, falls);
+            damps = i_mass;
+            return;
+        }
         const L l2 = l * l, l4 = l2 * l2, q = inverse(l + l4 * c1);
         i_mass = 6.0 * l4 * q;
         falls = -1.5 * q;
