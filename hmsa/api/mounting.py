@@ -54,7 +54,7 @@ def _held(block: ActuatorParameters, mount: str, ratio: float | None) -> Actuato
     given = math.inf if block.law is not None else block.chain_limit
 
     def made(damping_ratio: float) -> ActuatorParameters:
-        found = mounted(shape, mount, given, damping_ratio)
+        found = mounted(shape, mount, given, damping_ratio, block.bulk_ratio)
         return replace(
             block, shear_modulus=block.shear_modulus * found.stiffness,
             mass_factor=found.mass_factor, transverse_mass_factor=found.transverse_mass_factor,
@@ -80,10 +80,47 @@ def _clamped(beam: ActuatorParameters, _: str, ratio: float | None) -> ActuatorP
     return replace(made, modes=clamped(ratio))
 
 
-def mount_facts(actuator: ActuatorParameters) -> list[tuple[str, str]]:
-    """Return names and values of what modes change; none for a block without modes."""
+def further_facts(actuator: ActuatorParameters) -> list[tuple[str, str]]:
+    """Return names and values of what modes and compressibility change; none without them."""
     if actuator.rest == 0.0:
         return _facts_of_beam(actuator)
+    return _facts_of_volume(actuator) + _facts_of_modes(actuator)
+
+
+def _facts_of_volume(block: ActuatorParameters) -> list[tuple[str, str]]:
+    """Return what a compressible block changes, and what is left if this is ignored."""
+    if math.isinf(block.bulk_ratio):
+        return []
+    first = replace(block, modes=Modes())
+    ignored = replace(first, bulk_ratio=math.inf)
+    nu = 0.5 * math.sqrt(block.geometry.transverse)
+    load = elastic_force(1.0 + _MOVE, ignored.nondimensional)
+    off = 100.0 * (float(equilibrium_stretch(load, block.nondimensional)) - 1.0 - _MOVE) / _MOVE
+    side = block.side(1.0 + _MOVE)
+    # Modes contain the inertia of the sides.
+    apart = [] if block.modes else [('sides with own inertia', f'{_apart(block):.5g} Hz')]
+    return [
+        ("Poisson's ratio", f'{nu:.4g}'),
+        (f'side and volume at {1.0 + _MOVE:g}',
+         f'{side:.4f} ({ignored.side(1.0 + _MOVE):.4f}) and {(1.0 + _MOVE) * side ** 2:.4f} (1)'),
+        ('with constant volume', f'{1.0 / ignored.period:.5g} Hz'), *apart,
+        ('two_step, constant volume',
+         f'leaves {_left(first, ignored):.2g} % of a step to {1.0 + _MOVE:g}, and rests '
+         f'{abs(off):.2g} % off')]
+
+
+def _apart(block: ActuatorParameters) -> float:
+    """Return the first frequency in Hz of small uniform motion, with sides that do not follow."""
+    bulk = block.bulk_ratio
+    stiffness = np.array([[bulk + 4.0 / 3.0, 2.0 * bulk - 4.0 / 3.0],
+                          [2.0 * bulk - 4.0 / 3.0, 4.0 * bulk + 4.0 / 3.0]])
+    scale = np.array([block.geometry.inertia_c1 / 6.0, 2.0 / 3.0]) ** -0.5
+    squared = np.linalg.eigvalsh(stiffness * np.outer(scale, scale))
+    return math.sqrt(squared[0]) / (2.0 * math.pi * block.time_unit)
+
+
+def _facts_of_modes(actuator: ActuatorParameters) -> list[tuple[str, str]]:
+    """Return what the modes of a block change."""
     if not actuator.modes:
         return []
     paper = replace(actuator, mass_factor=1.0, transverse_mass_factor=1.0, modes=Modes())

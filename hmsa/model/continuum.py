@@ -10,12 +10,13 @@ Gent block about uniform stretch l, under the dead traction of the field on its 
 
 per volume of the undeformed block, with F = diag(l^-1/2, l^-1/2, l), W1 and W11 the derivatives of
 the energy by the first invariant, and p = 2 W1/l, for which the sides are free of stress. A bulk
-modulus K that is far above G replaces incompressibility. Displacements are products of Legendre
+modulus K that is far above G replaces constant volume; a block with a given one has the energy of
+`hmsa.model.compressible` instead. Displacements are products of Legendre
 polynomials, as in resonant ultrasound spectroscopy (W. M. Visscher et al., J. Acoust. Soc. Am. 90,
 2154, 1991). Lengths are in units of L, with G = rho = 1.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
@@ -27,10 +28,11 @@ from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
 from hmsa.errors import BadInputError, excerpt, meant
-from hmsa.model import law
+from hmsa.model import compressible, law
 from hmsa.model.equations import Array
 from hmsa.model.laws import elastica
 from hmsa.model.modes import BROAD, Modes, MOUNTS
+from hmsa.model.parameters import Geometry
 
 # Degree of the polynomials: the first frequency of the cube is then within 1e-4 of that of its
 # Lame mode (test_continuum).
@@ -41,6 +43,8 @@ _TOGETHER = 1e-3
 # Shares of the static stretch below which a mode is none that the field excites, and below which a
 # secondary mode is left out.
 _UNSEEN, _WEAKEST = 1e-6, 0.01
+# Least share of the first mode about a stretch, where another one may have more.
+_STRONG = 0.05
 # Secondary modes that are kept, and the maximum ratio of their frequencies. With a third one,
 # `modal` takes longer and leaves as much on finite elements (benchmarks continuum).
 _COUNT, _FASTEST = 2, 5.0
@@ -73,6 +77,11 @@ class Spectrum:
         """Index of the mode with the largest share."""
         return int(np.argmax(self.shares))
 
+    def like(self, frequency: float) -> int:
+        """Return the index of the strong mode whose frequency is nearest to that at rest."""
+        off = np.where(self.shares > _STRONG, abs(self.frequencies - frequency), math.inf)
+        return int(np.argmin(off))
+
 
 @dataclass(frozen=True)
 class Mounted:
@@ -85,7 +94,9 @@ class Mounted:
 
 
 @lru_cache(maxsize=64)
-def spectrum(shape: float, mount: str, stretch: float = 1.0, j_lim: float = math.inf) -> Spectrum:
+def spectrum(
+        shape: float, mount: str, stretch: float = 1.0, j_lim: float = math.inf,
+        bulk_ratio: float = math.inf) -> Spectrum:
     """
     Return the modes of a block that a field along its axis excites.
 
@@ -99,6 +110,8 @@ def spectrum(shape: float, mount: str, stretch: float = 1.0, j_lim: float = math
         Uniform stretch about which the block vibrates; 1 for a glued one.
     j_lim : float
         Limiting extensibility of the Gent model; infinite for neo-Hookean.
+    bulk_ratio : float
+        Bulk over shear modulus; infinite for constant volume.
 
     Returns
     -------
@@ -108,7 +121,7 @@ def spectrum(shape: float, mount: str, stretch: float = 1.0, j_lim: float = math
     """
     from scipy.linalg import solve  # slow to import
 
-    basis, stiffness, squared, vectors = _solved(shape, mount, stretch, j_lim)
+    basis, stiffness, squared, vectors = _solved(shape, mount, stretch, j_lim, bulk_ratio)
     flexible = float(basis.load @ solve(stiffness, basis.load, assume_a='sym'))
     shares = (vectors.T @ basis.load) ** 2 / squared / flexible
     # A unit load stretches a free block by 1/3, if it is small.
@@ -134,7 +147,7 @@ def mode_shapes(shape: float, count: int, points: Array) -> Array:
         Displacements in units of L, with a mean of 1 along the field on the face of the load.
 
     """
-    basis, _, squared, vectors = _solved(shape, 'free', 1.0, math.inf)
+    basis, _, squared, vectors = _solved(shape, 'free', 1.0, math.inf, math.inf)
     strength = (vectors.T @ basis.load) ** 2 / squared
     strong = np.sort(np.argsort(-strength)[:count])
     values = basis.at(np.asarray(points, dtype=np.float64))
@@ -144,31 +157,66 @@ def mode_shapes(shape: float, count: int, points: Array) -> Array:
 
 
 def _solved(
-        shape: float, mount: str, stretch: float, j_lim: float
+        shape: float, mount: str, stretch: float, j_lim: float, bulk_ratio: float
 ) -> tuple['_Basis', Array, Array, Array]:
     """Return the basis, its stiffness, and squared frequencies and shapes of all modes."""
     from scipy.linalg import eigh  # slow to import
 
     basis = _Basis.of(mount, 2.0 * shape if mount == 'glued' else shape)
+    even, along, across = (
+        _constant_volume(stretch, j_lim) if math.isinf(bulk_ratio)
+        else _compressible(stretch, j_lim, bulk_ratio))
+    component = basis.component
+    alike = component[:, None] == component
+    mass = np.where(alike, basis.integral(), 0.0)
+    stiffness = np.where(
+        alike, even * sum(basis.integral(x, x) for x in range(3)), 0.0)
+    for c, e in product(range(3), repeat=2):
+        # F:dF and tr(A) contain the gradient of each displacement along itself, tr(A A) also
+        # others.
+        stiffness += np.where(
+            (component == c)[:, None] & (component == e),
+            along[c, e] * basis.integral(c, e) + across[c, e] * basis.integral(e, c), 0.0)
+    return basis, stiffness, *eigh(stiffness, mass)
+
+
+def _constant_volume(stretch: float, j_lim: float) -> tuple[float, Array, Array]:
+    """Return the factors of dF:dF, and of the products of gradients, at constant volume."""
     side = stretch ** -0.5
     scale = np.array([side, side, stretch])
     left = 1.0 - (2.0 * side ** 2 + stretch ** 2 - 3.0) / j_lim
     by_invariant, bend = 0.5 / left, 0.5 / (j_lim * left ** 2)
     pressure = 2.0 * by_invariant * side ** 2
-    component = basis.component
-    alike = component[:, None] == component
-    mass = np.where(alike, basis.integral(), 0.0)
-    stiffness = np.where(
-        alike, 2.0 * by_invariant * sum(basis.integral(x, x) for x in range(3)), 0.0)
-    for c, e in product(range(3), repeat=2):
-        # F:dF and tr(A) contain the gradient of each displacement along itself, tr(A A) also
-        # others.
-        inverse = 1.0 / (scale[c] * scale[e])
-        stiffness += np.where(
-            (component == c)[:, None] & (component == e),
-            (4.0 * bend * scale[c] * scale[e] + (_BULK - pressure) * inverse)
-            * basis.integral(c, e) + pressure * inverse * basis.integral(e, c), 0.0)
-    return basis, stiffness, *eigh(stiffness, mass)
+    inverse = 1.0 / np.outer(scale, scale)
+    return (
+        2.0 * by_invariant,
+        4.0 * bend * scale[:, None] * scale + (_BULK - pressure) * inverse,
+        pressure * inverse)
+
+
+def _compressible(stretch: float, j_lim: float, bulk_ratio: float) -> tuple[float, Array, Array]:
+    """
+    Return those factors with the energy of `hmsa.model.compressible`.
+
+    With the invariant I = J^(-2/3) F:F of the stretches without the change of volume, and its
+    derivative I' by F, the second derivative of the energy is
+
+        W1 I'' + W11 I'^2 + K (J^2 tr(A)^2 + (J - 1) J (tr(A)^2 - tr(A A))).
+    """
+    side = compressible.side(stretch, None, j_lim, bulk_ratio)
+    scale = np.array([side, side, stretch])
+    volume, square = float(np.prod(scale)), float(scale @ scale)
+    even = volume ** (-2.0 / 3.0)
+    left = 1.0 - (even * square - 3.0) / j_lim
+    by_invariant, bend = 0.5 / left, 0.5 / (j_lim * left ** 2)
+    slope = even * (2.0 * scale - 2.0 / 3.0 * square / scale)
+    inverse, ratio = 1.0 / np.outer(scale, scale), np.outer(scale, 1.0 / scale)
+    twice = by_invariant * even
+    return (
+        2.0 * twice,
+        bend * np.outer(slope, slope) - 4.0 / 3.0 * twice * (ratio + ratio.T)
+        + (4.0 / 9.0 * twice * square + bulk_ratio * volume * (2.0 * volume - 1.0)) * inverse,
+        (2.0 / 3.0 * twice * square - bulk_ratio * volume * (volume - 1.0)) * inverse)
 
 
 @dataclass(frozen=True)
@@ -263,7 +311,9 @@ def check_mount(mount: Any) -> None:
 
 
 @lru_cache(maxsize=64)
-def mounted(shape: float, mount: str, j_lim: float, damping_ratio: float) -> Mounted:
+def mounted(
+        shape: float, mount: str, j_lim: float, damping_ratio: float,
+        bulk_ratio: float = math.inf) -> Mounted:
     """
     Return how a mounted block differs from the paper's model.
 
@@ -277,6 +327,8 @@ def mounted(shape: float, mount: str, j_lim: float, damping_ratio: float) -> Mou
         Limiting extensibility.
     damping_ratio : float
         Of the first mode. That of the others grows with their frequency, as by a viscous stress.
+    bulk_ratio : float
+        Bulk over shear modulus; infinite for constant volume.
 
     Returns
     -------
@@ -294,18 +346,27 @@ def mounted(shape: float, mount: str, j_lim: float, damping_ratio: float) -> Mou
         raise BadInputError(
             f'half_thickness/half_length is {shape:g}: expected {_SHAPES[0]:g} to '
             f'{_SHAPES[1]:g} for mount {mount}')
-    found = spectrum(shape, mount)
+    found = spectrum(shape, mount, bulk_ratio=bulk_ratio)
     free = mount == 'free'
+    # E/(3 G), and the transverse inertia.
+    young = 1.0 if math.isinf(bulk_ratio) else 3.0 * bulk_ratio / (3.0 * bulk_ratio + 1.0)
+    across = Geometry(1.0, shape, bulk_ratio=bulk_ratio).transverse
     # A free block deforms uniformly at rest: its compliance exceeds 1 by that of the volume.
-    stiffness = 1.0 if free else 1.0 / found.compliance
+    stiffness = 1.0 if free else 1.0 / (young * found.compliance)
     first = found.first
-    factor = stiffness * 18.0 / (1.0 + 2.0 * shape ** 2) / found.frequencies[first] ** 2
+    frequency = float(found.frequencies[first])
+    factor = stiffness * young * 18.0 / (across + 2.0 * shape ** 2) / frequency ** 2
     ratios, shares = _lines(found)
     # A change of level excites a mode in proportion to its share, several of them slow ones more.
     strong = sorted([i for i in np.argsort(-shares / ratios) if ratios[i] <= _FASTEST
                      and shares[i] >= _WEAKEST][:_COUNT])
+
+    def about(stretch: float) -> tuple[Array, Array]:
+        there = spectrum(shape, 'free', stretch, j_lim, bulk_ratio)
+        return there.frequencies / there.frequencies[there.like(frequency)], there.shares
+
     exponents = (
-        _exponents(shape, j_lim, ratios[strong], shares[strong]) if free
+        _exponents(about, ratios[strong], shares[strong]) if free
         else ([0.0] * len(strong),) * 2)
     rows = [*zip(
         ratios[strong].tolist(), shares[strong].tolist(),
@@ -318,7 +379,8 @@ def mounted(shape: float, mount: str, j_lim: float, damping_ratio: float) -> Mou
         ratio = float(np.sum(shares[weak]) / np.sum(shares[weak] / ratios[weak]))
         rows.append((ratio, left, BROAD, 0.0, 0.0))
     return Mounted(
-        stiffness, float(factor), _transverse(shape, j_lim, factor) if free else 1.0,
+        stiffness, float(factor),
+        _transverse(shape, j_lim, bulk_ratio, frequency, factor) if free else 1.0,
         Modes.of_numbers(rows))
 
 
@@ -353,30 +415,28 @@ def clamped(damping_ratio: float) -> Modes:
 
 
 def _exponents(
-        shape: float, j_lim: float, ratios: Array, shares: Array
+        about: Callable[[float], tuple[Array, Array]], ratios: Array, shares: Array
 ) -> tuple[list[float], list[float]]:
     """Return the exponents of the stretch in the frequency ratios and shares of some modes."""
-    low, high = (_near(shape, j_lim, x, ratios)[0] for x in _BESIDE)
+    low, high = (_near(*about(x), ratios)[0] for x in _BESIDE)
     exponents: Array = np.log(high / low) / math.log(_BESIDE[1] / _BESIDE[0])
     logs: Array = np.log(_STRETCHES)
     grown = np.array([
-        _odds(_near(shape, j_lim, x, ratios * x ** exponents)[1]) for x in _STRETCHES])
+        _odds(_near(*about(x), ratios * x ** exponents)[1]) for x in _STRETCHES])
     slopes: Array = logs @ (grown - _odds(shares)) / (logs @ logs)
     return np.clip(exponents, -5.0, 5.0).tolist(), np.clip(slopes, -10.0, 10.0).tolist()
 
 
-def _near(shape: float, j_lim: float, stretch: float, ratios: Array) -> tuple[Array, Array]:
+def _near(lines: Array, shares: Array, ratios: Array) -> tuple[Array, Array]:
     """
     Return frequency ratios and shares about a stretch of the modes nearest to some ratios.
 
     Modes that come close to each other exchange their shares, and count as one.
     """
-    found = spectrum(shape, 'free', stretch, j_lim)
-    lines = found.frequencies / found.frequencies[found.first]
     apart = np.abs(np.log(lines[:, None] / ratios))
     own = (apart < _REACH) & (apart == np.min(apart, axis=1, keepdims=True))
     own |= apart == np.min(apart, axis=0)
-    parts = own * found.shares[:, None]
+    parts = own * shares[:, None]
     return lines @ parts / np.sum(parts, axis=0), np.sum(parts, axis=0)
 
 
@@ -386,21 +446,27 @@ def _odds(shares: Array) -> Array:
     return found
 
 
-def _transverse(shape: float, j_lim: float, factor: float) -> float:
+def _transverse(
+        shape: float, j_lim: float, bulk_ratio: float, first: float, factor: float) -> float:
     """Return the transverse factor that fits the first mode about several stretches best."""
     from scipy.optimize import minimize_scalar  # slow to import
 
     c1 = 2.0 * shape ** 2
-    wanted = []
+    wide = Geometry(1.0, shape, bulk_ratio=bulk_ratio).transverse
+    material = law.pack(0.0, j_lim, c1, None if math.isinf(bulk_ratio) else compressible.condensed(
+        None, j_lim, bulk_ratio))
+    wanted, lateral = [], []
     for stretch in _STRETCHES:
-        found = spectrum(shape, 'free', stretch, j_lim)
-        stiffness = float(law.elastic_stiffness(stretch, law.pack(0.0, j_lim, c1)))
-        wanted.append(stiffness / float(found.frequencies[found.first]) ** 2)
+        found = spectrum(shape, 'free', stretch, j_lim, bulk_ratio)
+        stiffness = float(law.elastic_stiffness(stretch, material))
+        lateral.append(stretch ** -3 if math.isinf(bulk_ratio)
+                       else 6.0 * float(law.mass(stretch, material)) - c1)
+        wanted.append(stiffness / float(found.frequencies[found.like(first)]) ** 2)
 
     def off(log: float) -> float:
         more = math.exp(log)
         return sum((math.log(
-            factor * (1.0 + c1) / (more + c1) * (more * x ** -3 + c1) / 6.0 / y)) ** 2
-            for x, y in zip(_STRETCHES, wanted, strict=True))
+            factor * (wide + c1) / (more * wide + c1) * (more * x + c1) / 6.0 / y)) ** 2
+            for x, y in zip(lateral, wanted, strict=True))
 
     return math.exp(minimize_scalar(off, bounds=_LOGS, method='bounded').x)
