@@ -101,10 +101,10 @@ class Bounds:
         if not -math.inf < least < rest < most < math.inf:
             raise BadInputError(
                 f'{what.plural} from {least:g} to {most:g}: expected a range with {rest:g} inside')
-        if actuator.law is None:
+        if actuator.energy is None:
             return least, most
         # Beyond the ends of a table the force is unknown.
-        ends = [rest + _MARGIN * (x - rest) for x in actuator.law.limits]
+        ends = [rest + _MARGIN * (x - rest) for x in actuator.energy.limits]
         return max(least, ends[0]), min(most, ends[1])
 
 

@@ -199,7 +199,7 @@ def file_text(found: Identification, belief: Belief, run: str, now: datetime) ->
         if key not in written:
             scale = key == f'law.{found.shown("shear_modulus")[0]}'
             name = key.removeprefix('actuator.')
-            own = [name] if name in quantities.FACTORS else [
+            own = [name] if name in (*quantities.FACTORS, 'bulk_ratio') else [
                 x for names in quantities.SECONDARY for x in names if x.startswith(key)]
             sought = ['shear_modulus'] if scale else [x for x in own if x in found.names] or [
                 x for x, (constant, _) in quantities.constants_of(actuator.law).items()

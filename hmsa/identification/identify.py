@@ -50,6 +50,8 @@ _CLOSER = 0.97
 _ALONG = (
     'the beam is fitted along its elastica (law.shape: elastica), and plans with these values '
     'need the same')
+# Largest bulk modulus to begin with, in units of G.
+_BULK_RATIO = 100.0
 # Maximum overshoot of the moves of a shaped run, as a fraction of the step.
 _SHAPED = 0.15
 
@@ -117,6 +119,8 @@ def identify(
     if 'chain_limit' in free:
         # Infinite J_lim is no start value: the derivative is by its inverse.
         values['chain_limit'] = min(values['chain_limit'], 1e9)
+    if 'bulk_ratio' in free:
+        values['bulk_ratio'] = min(values['bulk_ratio'], _BULK_RATIO)
     at_rest = begins_at_rest(recording) and not {'initial_stretch', 'initial_rate'} & set(free)
     recording = replace(
         recording, at_rest=at_rest, notes=(*recording.notes, *filter(None, notes)))

@@ -136,8 +136,10 @@ def static(
     # Motion may exceed the range that can be held, but not that in which the force is defined.
     ends = group.rest + 1.002 * (np.array([low, high]) - group.rest)
     shape = np.full(len(limits), group.c1)
-    for limit, material in zip(
-            limits, pack(0.0 * shape, np.array(limits), shape, group.law), strict=True):
+    materials: Any = pack(0.0 * shape, np.array(limits), shape, group.law)
+    if math.isfinite(values['bulk_ratio']):
+        materials = [quantities.group_of({**values, 'chain_limit': x}).packed for x in limits]
+    for limit, material in zip(limits, materials, strict=True):
         if not np.all(np.isfinite(_evaluated(FORCE, ends, material))):
             continue
         force = _evaluated(FORCE, stretch, material)

@@ -48,10 +48,10 @@ class Known:
         """Return the values in parameters by dotted name; raise `BadInputError` if unusable."""
         names, values, flat = (
             settings.get(PREFIX + x) or [] for x in ('names', 'values', 'covariance'))
-        # Constants of a model, modes and factors of the mass are not estimated further: keep only
-        # the other parameters.
+        # Constants of a model, modes, compressibility and factors of the mass are not estimated
+        # further: keep only the other parameters.
         kept = [i for i, x in enumerate(names)
-                if not x.startswith(('law.', 'modes.')) and x not in FACTORS]
+                if not x.startswith(('law.', 'modes.')) and x not in (*FACTORS, 'bulk_ratio')]
         if not kept:
             return cls()
         free = check_free(names[i] for i in kept)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from hmsa.errors import BadInputError, meant
+from hmsa.model.compressible import BULK_RATIOS, condensed
 from hmsa.model.creep import Creep
 from hmsa.model.equations import Array
 from hmsa.model.flows import CONSTANTS, FLOWS
@@ -78,6 +79,10 @@ QUANTITIES: dict[str, Quantity] = {
         '', 1.0, 'linear', constant.minimum, constant.maximum,
         f'{_CREEP}, from steps of different heights')
        for name, constant in CONSTANTS.items() for x in _NUMBERS},
+    'bulk_ratio': Quantity(
+        '', math.inf, 'inverse', *BULK_RATIOS,
+        'record rest at three or more levels of both signs, and motion about them, with '
+        'shear_modulus or density known'),
     'mass_factor': Quantity('', advice=_STEP),
     'transverse_mass_factor': Quantity(
         '', least=0.1, most=10.0,
@@ -259,7 +264,8 @@ def values_of(
                 f'{name} is {value:g}: expected a finite number of at least {quantity.least:g}')
     return {name: x.default for name, x in QUANTITIES.items()} | actuator.numbers | {
         'time_unit': actuator.time_unit, 'law': actuator.law, 'initial_stretch': actuator.rest,
-        **actuator.factors, **_modes_of(actuator.modes), **others}
+        'bulk_ratio': actuator.bulk_ratio, **actuator.factors, **_modes_of(actuator.modes),
+        **others}
 
 
 def _modes_of(modes: Modes) -> dict[str, float]:
@@ -284,7 +290,7 @@ def actuator_of(values: Mapping[str, Any]) -> ActuatorParameters:
         damping_coefficient=values['damping_coefficient'], law=values.get('law'),
         creep=values.get('creep', Creep()),
         modes=Modes.of_numbers([[values[x] for x in names] for names in modes_of(values)]),
-        **{x: values[x] for x in FACTORS})
+        bulk_ratio=values['bulk_ratio'], **{x: values[x] for x in FACTORS})
 
 
 def flow_of(values: Mapping[str, Any], free: Iterable[str]) -> Flow:
@@ -300,7 +306,15 @@ def flow_of(values: Mapping[str, Any], free: Iterable[str]) -> Flow:
 def group_of(values: Mapping[str, Any]) -> NondimensionalParameters:
     """Return the dimensionless group of values from `values_of`, without damping."""
     return NondimensionalParameters(
-        0.0, values['chain_limit'], geometry_of(values).inertia_c1, values.get('law'))
+        0.0, values['chain_limit'], geometry_of(values).inertia_c1, energy_of(values))
+
+
+def energy_of(values: Mapping[str, Any]) -> Elastic | None:
+    """Return the elastic energy, with the change of volume if there is one; None for Gent."""
+    law: Elastic | None = values.get('law')
+    if math.isinf(values['bulk_ratio']):
+        return law
+    return condensed(law, values['chain_limit'], values['bulk_ratio'])
 
 
 def modulus_of(law: Elastic | None) -> tuple[str, float]:
@@ -315,7 +329,7 @@ def geometry_of(values: Mapping[str, Any]) -> Geometry:
     """Return the geometric factors of values of all quantities."""
     return Geometry(
         values['half_length'], values['half_thickness'], values.get('law'),
-        **{x: values[x] for x in FACTORS})
+        bulk_ratio=values['bulk_ratio'], **{x: values[x] for x in FACTORS})
 
 
 def damping_unit(values: Mapping[str, Any]) -> float:

@@ -1,6 +1,6 @@
 """Simulated measurement of a recording, with derivatives by the free parameters."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 import math
@@ -24,8 +24,9 @@ from hmsa.motion import theta as places
 #: Relative tolerance of the integration: far below the noise of any sensor.
 RTOL = 1e-8
 _NOTHING: Array = np.empty(0)
-# Parameters whose derivatives are central differences of the motion, and half their width.
-_ASIDE, _WIDTH = ('transverse_mass_factor',), 1e-3
+# Parameters whose derivatives are central differences of the motion, and half their width in
+# coordinates; for moduli, in units of the shear modulus.
+_ASIDE, _WIDTH = ('transverse_mass_factor', 'bulk_ratio'), 1e-3
 _SENSOR = ('stretch_bias', 'stretch_gain', 'sensor_latency')
 # Parameters to which values of theta are proportional, by index.
 _LINEAR = {
@@ -98,14 +99,43 @@ def _chain(
             chain[name] = {i: 2.0 * x * density / values[name] for i, x in per_density.items()}
         elif name in ('density', 'mass_factor'):
             chain[name] = {i: x * density / values[name] for i, x in per_density.items()}
+        elif name in differenced(values, free):
+            continue
         elif name == 'chain_limit':
             chain[name] = {places.CONSTANT: -1.0 / values[name] ** 2}
-        elif name not in (*_SENSOR, *_ASIDE):
+        elif name not in _SENSOR:
             constant, i = quantities.constants_of(values['law'])[name]
             # The scale of the model stays: constants in Pa change its force in proportion.
             chain[name] = {places.CONSTANT + constant.place + 2 * i: (
                 1.0 / values['shear_modulus'] if constant.unit == 'Pa' else 1.0)}
     return theta, chain
+
+
+def differenced(values: Mapping[str, Any], free: Sequence[str]) -> tuple[str, ...]:
+    """
+    Return the free parameters whose derivatives are differences of the motion.
+
+    With a change of volume, these include the constants of the hyperelastic model.
+    """
+    aside = _ASIDE if math.isinf(values['bulk_ratio']) else (
+        *_ASIDE, 'chain_limit', *quantities.constants_of(values['law']))
+    return tuple(x for x in free if x in aside)
+
+
+def difference(
+        values: Mapping[str, Any], name: str, of: Callable[[Mapping[str, Any]], Array | None]
+) -> Array | None:
+    """Return the derivative of a function of the values by a coordinate; None if it fails."""
+    width = _WIDTH
+    if quantities.quantity_of(name).unit == 'Pa':
+        width *= values['shear_modulus']
+    middle = quantities.to_coordinate(name, values[name])
+    ends = [quantities.values_at(values, (name,), np.array([middle + x])) for x in (width, -width)]
+    found = [of(x) for x in ends]
+    if found[0] is None or found[1] is None:
+        return None
+    one, other = (quantities.to_coordinate(name, x[name]) for x in ends)
+    return (found[0] - found[1]) / (one - other)
 
 
 @lru_cache(maxsize=32)
@@ -145,8 +175,9 @@ class ResponseArguments:
         inner = sorted({i for x in chain.values() for i in x})
         rows = {x: i for i, x in enumerate(inner)}
         material = _packed(
-            values['chain_limit'], quantities.geometry_of(values).inertia_c1, values['law']).copy()
-        if 'chain_limit' in free:
+            values['chain_limit'], quantities.geometry_of(values).inertia_c1,
+            quantities.energy_of(values)).copy()
+        if 'chain_limit' in free and math.isinf(values['bulk_ratio']):
             material[KIND] = GENT
         mixing = np.zeros((len(inner) + len(more), len(free) + len(more)))
         for j, name in enumerate(free):
@@ -206,14 +237,16 @@ def respond(
         return None
     raw *= values['stretch_gain']
     shown, jacobian = sensed(values, free, stretch, rate, raw[:, :inner_count] @ setup.mixing)
-    for j, name in enumerate(free):
-        if name in _ASIDE:
-            ends = [respond(
-                recording, {**values, name: values[name] * math.exp(x)}, (), rtol=rtol,
-                shifts=shifts) for x in (_WIDTH, -_WIDTH)]
-            if ends[0] is None or ends[1] is None:
-                return None
-            jacobian[:, j] = (ends[0].stretch - ends[1].stretch) / (2.0 * _WIDTH)
+
+    def shown_at(other: Mapping[str, Any]) -> Array | None:
+        found = respond(recording, other, (), rtol=rtol, shifts=shifts)
+        return None if found is None else found.stretch
+
+    for name in differenced(values, free):
+        by = difference(values, name, shown_at)
+        if by is None:
+            return None
+        jacobian[:, free.index(name)] = by
     return Response(values, shown, rate, jacobian, raw[:, inner_count:])
 
 

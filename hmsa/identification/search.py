@@ -2,17 +2,24 @@
 
 from collections.abc import Mapping, Sequence
 import math
+from typing import Any
 
 import numpy as np
 
 from hmsa import motion
 from hmsa.errors import BadInputError
-from hmsa.identification import diagnosis
+from hmsa.identification import diagnosis, quantities
 from hmsa.identification.fit import Fit, fit, loss, robust_scale
 from hmsa.identification.initial_guess import at_units, scan, seeks_time, segments, starts, static
 from hmsa.identification.measurement import Measurement
 from hmsa.identification.quantities import STATIC
-from hmsa.identification.response import respond, ResponseArguments, sensed
+from hmsa.identification.response import (
+    difference,
+    differenced,
+    respond,
+    ResponseArguments,
+    sensed,
+)
 from hmsa.model.equations import Array
 
 # Ratio of residuals to their increments up to which they are white enough for a first check.
@@ -187,6 +194,17 @@ def unmoved(best: Fit) -> set[str]:
     rests, by = sensed(
         values, best.free, rests, np.zeros(len(rests)),
         values['stretch_gain'] * slopes @ setup.mixing)
+
+    def rests_at(other: Mapping[str, Any]) -> Array | None:
+        setup = ResponseArguments.of(quantities.complete(other, ()), ())
+        found = np.array([motion.rest(
+            setup.theta, setup.material, x, setup.wanted, np.empty(0)) for x in levels.tolist()])
+        return values['stretch_gain'] * found if np.all(np.isfinite(found)) else None
+
+    for name in differenced(values, best.free):
+        column = difference(values, name, rests_at)
+        if column is not None:
+            by[:, best.free.index(name)] = column
     weighted = best.root * (recording.stretch - rests[which])
     columns = best.root[:, None] * by[which]
     shift, _, rank, _ = np.linalg.lstsq(columns, weighted, rcond=1e-9)

@@ -86,11 +86,15 @@ class Prior:
             raise BadInputError(
                 f'{", ".join(wrong)} cannot be tracked: expected some of '
                 + ', '.join(x for x in DEVIATIONS if x not in _NOT_TRACKED))
+        elastic = actuator.energy is not None
+        if elastic and 'chain_limit' in free:
+            raise BadInputError(
+                'chain_limit cannot be tracked with a finite bulk_ratio: expected the others')
         named = len(free)
         if suspects:
             free = (*free, *(
                 x for x in SUSPECTS if x not in free and x not in without
-                and not (x == 'chain_limit' and actuator.law is not None)
+                and not (x == 'chain_limit' and elastic)
                 and not (x.startswith('viscoelastic') and any(actuator.creep.ratios))))
         # Feedback does not model secondary modes.
         values: dict[str, Any] = complete(values_of(
