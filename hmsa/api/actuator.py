@@ -26,7 +26,7 @@ from hmsa.api.arguments import (
 )
 from hmsa.api.doubts import unquestioned, warn
 from hmsa.api.facts import facts
-from hmsa.api.mounting import mount_facts, with_mount
+from hmsa.api.mounting import further_facts, with_mount
 from hmsa.errors import assume, BadInputError, excerpt, meant, UnusualWarning
 from hmsa.files import write_text, yaml_text
 from hmsa.interfaces.actuator import actuator_from, model_from, parameters_of
@@ -93,6 +93,8 @@ class Actuator:
         Constants of the model in SI units, such as ``{'c10': 5e3, 'c20': 200.0, 'c30': 0.0}``.
     creep : sequence of (float, float)
         Viscoelastic branches: stiffness relative to the model's, and relaxation time in s.
+    bulk_ratio : float
+        Bulk over shear modulus of a compressible block, 1 to 1e6; infinite for constant volume.
     flux_density_limits : float or (float, float)
         Limits of the coil in T; one number for both directions.
     slew_limit : float
@@ -140,7 +142,7 @@ class Actuator:
             remanence: float = 0.1, chain_limit: float = 5.0, zeta: float | None = None,
             damping_ratio: float | None = None, damping_coefficient: float | None = None,
             law: str = 'gent', constants: Mapping[str, Any] | None = None,
-            creep: Sequence[tuple[float, float]] = (),
+            creep: Sequence[tuple[float, float]] = (), bulk_ratio: float = math.inf,
             flux_density_limits: float | tuple[float, float] = _STRONGEST,
             slew_limit: float = math.inf, coil_time_constant: float = 0.0,
             mount: str = 'paper', thermal: Mapping[str, float] | None = None) -> None:
@@ -149,7 +151,7 @@ class Actuator:
             'half_thickness': half_length if half_thickness is None else half_thickness,
             'remanence': remanence, 'chain_limit': chain_limit, 'zeta': zeta,
             'damping_ratio': damping_ratio, 'damping_coefficient': damping_coefficient,
-            'law': law, 'constants': constants, 'creep': creep,
+            'law': law, 'constants': constants, 'creep': creep, 'bulk_ratio': bulk_ratio,
             'flux_density_limits': flux_density_limits, 'slew_limit': slew_limit,
             'coil_time_constant': coil_time_constant, 'thermal': thermal}
         if all(given[x] is None for x in DAMPED):
@@ -363,7 +365,7 @@ class Actuator:
         """
         return Table(
             (Column('quantity'), Column('value')),
-            (*facts(self.scales, self.block), *mount_facts(self.block)))
+            (*facts(self.scales, self.block), *further_facts(self.block)))
 
     def __repr__(self) -> str:
         size = ' x '.join(f'{2e3 * x:.4g}' for x in (

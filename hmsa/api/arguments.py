@@ -12,7 +12,13 @@ from typing import Any, ParamSpec, TypeVar
 import numpy as np
 
 from hmsa.errors import BadInputError, excerpt, meant
-from hmsa.interfaces.parameters import ACTUATOR, COIL_TIME_CONSTANT, LAW_NAME, THERMAL
+from hmsa.interfaces.parameters import (
+    ACTUATOR,
+    BULK_RATIO,
+    COIL_TIME_CONSTANT,
+    LAW_NAME,
+    THERMAL,
+)
 from hmsa.model.equations import Array
 from hmsa.model.laws import LAWS
 from hmsa.model.moves import impossible
@@ -20,7 +26,7 @@ from hmsa.model.moves import impossible
 #: Arguments of `Actuator` of which one describes the damping.
 DAMPED = ('zeta', 'damping_ratio', 'damping_coefficient')
 # Arguments of `Actuator` that are single numbers, and those that may be None.
-_NUMBERS = {x.name.rpartition('.')[2]: x for x in (*ACTUATOR, COIL_TIME_CONSTANT)}
+_NUMBERS = {x.name.rpartition('.')[2]: x for x in (*ACTUATOR, BULK_RATIO, COIL_TIME_CONSTANT)}
 _OPTIONAL = ('shear_modulus', 'half_thickness', *DAMPED, 'constants', 'thermal')
 # Shortest period of a command grid in s.
 _FINEST = 1e-9

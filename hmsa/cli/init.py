@@ -30,7 +30,7 @@ from hmsa.cli.options import (
 )
 from hmsa.errors import BadInputError
 from hmsa.files import check_targets, write_text, yaml_text
-from hmsa.interfaces.parameters import LAW, LAW_NAME, MODES, PUBLISH_RATE
+from hmsa.interfaces.parameters import BULK_RATIO, LAW, LAW_NAME, MODES, PUBLISH_RATE
 from hmsa.interfaces.quantities import (
     DAMPING,
     default_of,
@@ -120,7 +120,7 @@ def run(arguments: argparse.Namespace) -> int:
             given[quantity.key] = default_of(quantity, given)
     from hmsa.api.doubts import doubts as doubts_of
     from hmsa.api.facts import facts
-    from hmsa.api.mounting import mount_facts
+    from hmsa.api.mounting import further_facts
 
     made = _actuator(form, given, arguments.law, arguments.mount)
     found = made.scales
@@ -134,7 +134,7 @@ def run(arguments: argparse.Namespace) -> int:
             'is only as exact as its parameters; measure them and pass the values')
     parameters = _parameters(made)
     table = [f'{name:<26} {value}' for name, value in [
-        *facts(found, made.block), *mount_facts(made.block)]]
+        *facts(found, made.block), *further_facts(made.block)]]
     write_text(path, '\n'.join([
         '# Parameters of an actuator for planner and plant, written by hmsa init:',
         *(f'#   hmsa {x} --ros-args --params-file {quote(path.name)}' for x in _NODES),
@@ -231,7 +231,7 @@ def _actuator(
 
 def _lines(form: str, parameters: Mapping[str, Any], guessed: Collection[str]) -> list[str]:
     """Return the nodes' parameters in YAML, each below its description, which marks guesses."""
-    texts = {x.name: (x.description.rstrip('.'), x.unit) for x in (*LAW, *MODES)} | {
+    texts = {x.name: (x.description.rstrip('.'), x.unit) for x in (*LAW, BULK_RATIO, *MODES)} | {
         x.parameter: (x.text, x.unit) for x in (*QUANTITIES, DAMPING)}
     if form == 'beam':
         texts |= {

@@ -60,6 +60,8 @@ def add_parser(subparsers: Any) -> None:
         ('--start', 'S', float,
          'initial stretch, at rest (default 1; 0 for the deflection of a beam)'),
         *((option, metavar, float, text) for option, metavar, text in MATERIAL), LAW_OPTION,
+        ('--bulk-ratio', 'K', float,
+         'bulk over shear modulus of a compressible block, 1 to 1e6 (default constant volume)'),
         ('--shaper', 'NAME', str,
          'two_step (default), robust, minimax, minimum_time, modal, smooth, step, zv, zvd, ei or '
          'umzv'),
@@ -227,7 +229,7 @@ def _actuator(arguments: argparse.Namespace) -> 'Actuator':
     """Return the actuator of the file; raise `BadInputError` for options that the file sets."""
     from hmsa.api.actuator import Actuator
 
-    fixed = [f'--{x.replace("_", "-")}' for x in ('zeta', 'j_lim', 'c1', 'law')
+    fixed = [f'--{x.replace("_", "-")}' for x in ('zeta', 'j_lim', 'c1', 'law', 'bulk_ratio')
              if getattr(arguments, x, None) is not None]
     if fixed:
         raise BadInputError(
@@ -301,6 +303,12 @@ def _group(arguments: argparse.Namespace) -> 'NondimensionalParameters':
             # In a dimensionless plan, only ratios of moduli matter.
             given['law'] = law.scaled({x.name: x.default for x in LAW} | {
                 'actuator.remanence': 1.0} | {f'law.{x}': y for x, y in constants.items()})[1]
+    if getattr(arguments, 'bulk_ratio', None) is not None:
+        from hmsa.model.compressible import check, condensed
+
+        elastic, j_lim = given.get('law'), given.get('j_lim', NondimensionalParameters.j_lim)
+        check(arguments.bulk_ratio, elastic)
+        given['law'] = condensed(elastic, j_lim, arguments.bulk_ratio)
     return NondimensionalParameters(**given)
 
 

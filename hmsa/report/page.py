@@ -326,6 +326,8 @@ def _parameters(parts: Sequence[Part]) -> Table:
           if field != 'chain_limit' or gent),
         *((spec.name, spec.unit or '1', *(_given(x.get(spec.name)) for x in laws))
           for spec in LAW if any(spec.name in x for x in laws)),
+        *([('bulk modulus over G', '1', *(x.bulk_ratio for x in blocks))]
+          if any(math.isfinite(x.bulk_ratio) for x in blocks) else []),
         ('zeta', '1', *(x.zeta for x in groups)),
         (f'critical zeta about {name} {blocks[0].rest:g}', '1', *(
             float(critical_zeta(x.rest, x)) for x in groups)),
