@@ -18,7 +18,8 @@ laboratories, for half an hour. laboratory tunes laboratories behind a serial bo
 of an hour; line makes cables, boards, amplifiers and sensors fail there, for two minutes. studies
 kills the workers of a study. rates measures how many plans per second studies compute, for about
 seven minutes. lockstep compares the kernel of batches with C. continuum plays commands on finite
-elements, for five minutes; predictions compares what plans predict there, for two; beam plays
+elements, for five minutes; compressible compares a compressible block with them, for three;
+predictions compares what plans predict there, for two; beam plays
 them on an exact rod, for three; beam-identification identifies
 recordings of this rod, for five.
 repeats plays what `hmsa learn` makes of repeats on finite elements and an exact rod, for half an
@@ -48,7 +49,7 @@ NAMES = ('judge', 'planner', 'plant', 'preemption', 'joints', 'controller', 'rec
          'crash')
 #: Only run on request: they take long and need the machine for themselves.
 LONG = ('faults', 'soak', 'feedback', 'identification', 'defects', 'harm', 'laboratory',
-        'line', 'studies', 'rates', 'lockstep', 'continuum', 'predictions',
+        'line', 'studies', 'rates', 'lockstep', 'continuum', 'compressible', 'predictions',
         'repeats', 'beam', 'beam-identification', 'modes')
 
 
@@ -180,6 +181,10 @@ def main(arguments: list[str] | None = None) -> int:
         from benchmarks import bench_continuum
 
         add(bench_continuum.compare(quick=options.quick))
+    if 'compressible' in names:
+        from benchmarks import bench_compressible
+
+        add(bench_compressible.compare(quick=options.quick))
     if 'predictions' in names:
         from benchmarks import bench_continuum
 

@@ -3,7 +3,7 @@ A block as a continuum, by explicit finite elements, to judge what the package's
 
 An eighth of a free block by symmetry, or a quarter of one that is glued with a face: bricks of
 eight nodes whose dilatation is averaged (Q1P0), a lumped mass and central differences. The
-material is that of Gent with a bulk modulus far above G and a viscous deviatoric stress. A uniform
+material is that of Gent with a bulk modulus and a viscous deviatoric stress. A uniform
 field along the magnetisation is a dead traction on the faces across it (R. Zhao et al., J. Mech.
 Phys. Solids 124, 244, 2019). Lengths are in units of L, with G = rho = 1. It shares no equation
 with the package.
@@ -11,14 +11,23 @@ with the package.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from hmsa.model.equations import Array
 
-# Bulk modulus, and its viscosity, which damps pressure waves; and the fraction of the largest
-# stable step.
-_BULK, _BULK_VISCOSITY, _STABLE = 100.0, 0.05, 0.5
+#: Bulk modulus that stands for constant volume.
+BULK = 100.0
+# Viscosity of the volume, which damps pressure waves, and the fraction of the largest stable step.
+_BULK_VISCOSITY, _STABLE = 0.05, 0.5
+# Half the difference of positions for a stiffness, loads on the way to one, Newton's steps to each
+# and the forces that remain.
+_NEAR, _LOADS, _NEWTON, _BALANCED = 1e-6, 2, 20, 1e-10
+# Modes to compute, and those of frequencies this close that act as one.
+_MODES, _TOGETHER = 24, 1e-4
+# Order of the elimination in a symmetric matrix.
+_ORDER = 'MMD_AT_PLUS_A'
 _GAUSS = 1.0 / np.sqrt(3.0)
 
 
@@ -31,6 +40,7 @@ class Block:
     viscosity: float  #: of the deviatoric stress, in units of L sqrt(G rho)
     cells: tuple[int, int, int]  #: elements along x, y and z, the direction of the field
     glued: bool = False  #: whether the face opposite to that of the load is fixed
+    bulk: float = BULK  #: bulk modulus
     position: Array = field(init=False)  #: shape (n, 3)
     velocity: Array = field(init=False)
 
@@ -39,7 +49,8 @@ class Block:
         sizes = np.array([1.0, 1.0, self.shape]) / self.cells
         axes = [np.arange(x + 1) * y for x, y in zip(self.cells, sizes, strict=True)]
         grid = np.stack(np.meshgrid(*axes, indexing='ij'), axis=-1)
-        self.position = grid.reshape(-1, 3).copy()
+        self._reference = grid.reshape(-1, 3)
+        self.position = self._reference.copy()
         self.velocity = np.zeros_like(self.position)
         number = np.arange(len(self.position)).reshape(grid.shape[:3])
         corners = [(i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1)]
@@ -64,12 +75,17 @@ class Block:
         self._top = number[:, :, -1].ravel()
         edges = [np.where((np.arange(n + 1) % n) == 0, 0.5, 1.0) / n for n in self.cells[:2]]
         self._areas = np.outer(*edges).ravel()
-        self._step = _STABLE * float(np.min(sizes)) / np.sqrt(_BULK + 4.0 / 3.0)
+        self._step = _STABLE * float(np.min(sizes)) / np.sqrt(self.bulk + 4.0 / 3.0)
 
     @property
     def stretch(self) -> float:
         """Mean stretch along the field."""
         return float(self._areas @ self.position[self._top, 2]) / self.shape
+
+    @property
+    def side(self) -> float:
+        """Largest transverse stretch of the face of the load."""
+        return float(np.max(self.position[self._top, 0]))
 
     def follow(self, pieces: Sequence[tuple[float, float]]) -> tuple[Array, Array]:
         """Follow pieces of duration and load; return times and mean stretches after each step."""
@@ -88,21 +104,96 @@ class Block:
                 stretches.append(self.stretch)
         return np.array(times), np.array(stretches)
 
+    def settle(self, load: float) -> None:
+        """Bring the block to rest under a load, by Newton's method."""
+        from scipy.sparse.linalg import splu
+
+        moves = np.flatnonzero(self._free)
+        self.velocity[:] = 0.0
+        for part in np.arange(1, _LOADS + 1) / _LOADS:
+            for _ in range(_NEWTON):
+                force = self._forces()
+                force[self._top, 2] += part * load * self._areas
+                off = force.ravel()[moves]
+                if np.max(np.abs(off)) < _BALANCED:
+                    break
+                self.position.ravel()[moves] += splu(
+                    self._stiffness(moves), _ORDER).solve(off)
+
+    def deform(self, along: float, across: float) -> None:
+        """Deform the block uniformly, at rest."""
+        self.position = self._reference * np.array([across, across, along])
+        self.velocity[:] = 0.0
+
+    def modes(self) -> tuple[Array, Array]:
+        """Return frequencies of small motion about here, and shares of the mean static stretch."""
+        from scipy.sparse.linalg import eigsh, LinearOperator, splu
+
+        moves = np.flatnonzero(self._free)
+        stiffness = self._stiffness(moves)
+        scale = np.repeat(self._mass, 3)[moves] ** -0.5
+        load = np.zeros_like(self.position)
+        load[self._top, 2] = self._areas
+        pull = load.ravel()[moves]
+        scaled = stiffness.multiply(scale[:, None]).multiply(scale).tocsc()
+        solve = splu(scaled, _ORDER).solve
+        squared, vectors = eigsh(
+            scaled, _MODES, sigma=0.0, v0=np.ones(len(scale)),
+            OPinv=LinearOperator(scaled.shape, solve))
+        pull = scale * pull
+        shares = (vectors.T @ pull) ** 2 / squared / float(pull @ solve(pull))
+        frequencies = np.sqrt(squared)
+        order = np.argsort(frequencies)
+        frequencies, shares = frequencies[order], shares[order]
+        groups = np.cumsum(np.append(0, np.diff(frequencies) > _TOGETHER * frequencies[1:]))
+        first = np.searchsorted(groups, np.arange(groups[-1] + 1))
+        return frequencies[first], np.bincount(groups, shares)
+
+    def _stiffness(self, moves: Array) -> Any:
+        """Return the stiffness of the free displacements, as a sparse matrix."""
+        from scipy.sparse import coo_array
+
+        around, still = self.position[self._nodes], np.zeros((len(self._nodes), 8, 3))
+        columns = []
+        for i in range(24):
+            ahead, behind = around.copy(), around.copy()
+            ahead.reshape(-1, 24)[:, i] += _NEAR
+            behind.reshape(-1, 24)[:, i] -= _NEAR
+            columns.append((self._of_elements(behind, still) - self._of_elements(ahead, still))
+                           .reshape(-1, 24) / (2.0 * _NEAR))
+        each = np.stack(columns, axis=2)
+        each = 0.5 * (each + each.transpose(0, 2, 1))
+        places = (3 * self._nodes[:, :, None] + np.arange(3)).reshape(-1, 24)
+        rows = np.broadcast_to(places[:, :, None], each.shape).ravel()
+        whole = coo_array(
+            (each.ravel(), (rows, np.broadcast_to(places[:, None, :], each.shape).ravel())),
+            shape=(self.position.size,) * 2).tocsc()
+        return whole[moves][:, moves].tocsc()
+
     def _forces(self) -> Array:
         """Return minus the internal forces of the nodes."""
-        count = len(self._nodes)
+        each = self._of_elements(self.position[self._nodes], self.velocity[self._nodes])
+        force = np.zeros_like(self.position)
+        for axis in range(3):
+            force[:, axis] = np.bincount(
+                self._nodes.ravel(), each[..., axis].ravel(), minlength=len(force))
+        return force
+
+    def _of_elements(self, position: Array, velocity: Array) -> Array:
+        """Return minus the internal forces of elements with nodes at positions (n, 8, 3)."""
+        count = len(position)
 
         def gradients(of: Array) -> Array:
             # Shape (elements, points, 3, 3).
-            found: Array = np.matmul(of[self._nodes].transpose(0, 2, 1), self._slopes)
+            found: Array = np.matmul(of.transpose(0, 2, 1), self._slopes)
             return found.reshape(count, 3, 8, 3).transpose(0, 2, 1, 3)
 
-        deformation, rate = gradients(self.position), gradients(self.velocity)
+        deformation, rate = gradients(position), gradients(velocity)
         volume, inverse = np.linalg.det(deformation), np.linalg.inv(deformation)
         # Velocity gradient.
         flow = rate @ inverse
         expansion = np.trace(flow, axis1=2, axis2=3)
-        pressure = _BULK * (volume.mean(axis=1) - 1.0) + _BULK_VISCOSITY * (
+        pressure = self.bulk * (volume.mean(axis=1) - 1.0) + _BULK_VISCOSITY * (
             volume * expansion).mean(axis=1)
         scale = volume ** (-2.0 / 3.0)
         invariant = np.sum(deformation ** 2, axis=(2, 3))
@@ -115,10 +206,6 @@ class Block:
             flow + flow.swapaxes(2, 3) - 2.0 / 3.0 * expansion[..., None, None] * identity)
         stress += (pressure[:, None] * volume)[..., None, None] * identity
         piola = stress @ inverse.swapaxes(2, 3)
-        each = np.matmul(
-            piola.transpose(0, 2, 1, 3).reshape(count, 3, -1), self._slopes.T) * self._weight
-        force = np.zeros_like(self.position)
-        for axis in range(3):
-            force[:, axis] = -np.bincount(
-                self._nodes.ravel(), each[:, axis].ravel(), minlength=len(force))
-        return force
+        each: Array = np.matmul(
+            piola.transpose(0, 2, 1, 3).reshape(count, 3, -1), self._slopes.T) * -self._weight
+        return each.transpose(0, 2, 1)
