@@ -83,6 +83,7 @@ def _chain(
         theta[places.FIRST_BRANCH + places.FLOW:first:places.BRANCH] = quantities.flow_of(
             values, free).kind
     per_density = {i: -float(theta[i]) / density for i in by_value}
+    aside = differenced(values, free)
     chain: dict[str, dict[int, float]] = {}
     for name in free:
         if name in own:
@@ -99,7 +100,7 @@ def _chain(
             chain[name] = {i: 2.0 * x * density / values[name] for i, x in per_density.items()}
         elif name in ('density', 'mass_factor'):
             chain[name] = {i: x * density / values[name] for i, x in per_density.items()}
-        elif name in differenced(values, free):
+        elif name in aside:
             continue
         elif name == 'chain_limit':
             chain[name] = {places.CONSTANT: -1.0 / values[name] ** 2}
@@ -126,16 +127,17 @@ def difference(
         values: Mapping[str, Any], name: str, of: Callable[[Mapping[str, Any]], Array | None]
 ) -> Array | None:
     """Return the derivative of a function of the values by a coordinate; None if it fails."""
-    width = _WIDTH
-    if quantities.quantity_of(name).unit == 'Pa':
-        width *= values['shear_modulus']
-    middle = quantities.to_coordinate(name, values[name])
-    ends = [quantities.values_at(values, (name,), np.array([middle + x])) for x in (width, -width)]
-    found = [of(x) for x in ends]
-    if found[0] is None or found[1] is None:
+    quantity, value = quantities.quantity_of(name), values[name]
+    width = _WIDTH * (values['shear_modulus'] if quantity.unit == 'Pa' else 1.0)
+    middle = quantities.to_coordinate(name, value)
+    least, most = min(quantity.least, value), max(quantity.most, value)
+    ends = [min(max(quantities.from_coordinate(name, middle + x), least), most)
+            for x in (width, -width)]
+    one, other = (of({**values, name: x}) for x in ends)
+    if one is None or other is None:
         return None
-    one, other = (quantities.to_coordinate(name, x[name]) for x in ends)
-    return (found[0] - found[1]) / (one - other)
+    return (one - other) / (
+        quantities.to_coordinate(name, ends[0]) - quantities.to_coordinate(name, ends[1]))
 
 
 @lru_cache(maxsize=32)
