@@ -33,6 +33,7 @@ from hmsa import Actuator  # noqa: E402
 from hmsa.interfaces.actuator import actuator_from  # noqa: E402
 from hmsa.interfaces.outcome import Outcome  # noqa: E402
 from hmsa.interfaces.parameters import BLOCK  # noqa: E402
+from hmsa.model.compressible import condensed  # noqa: E402
 from hmsa.model.continuum import mode_shapes, spectrum  # noqa: E402
 from hmsa.model.creep import Creep  # noqa: E402
 from hmsa.model.delivery import Delivery  # noqa: E402
@@ -270,6 +271,33 @@ def temperature(path: Path) -> None:
         style.finish(left, degrees, style.axis('flux density', unit='mT'), 'a')
         style.finish(middle, degrees, style.axis('time', 't_p', 'ms'), 'b')
         style.finish(right, degrees, style.axis('error', unit='% of step'), 'c')
+
+
+def compressibility(path: Path) -> None:
+    """Draw the command of a move by bulk modulus, and what is left by that of constant volume."""
+    ratios, time = np.geomspace(2.0, 1000.0, 19), np.linspace(0.0, 40.0, 8001)
+    with style.picture(path, 2.9, SCREEN) as figure:
+        left, middle, right = figure.subplots(1, 3)
+        for target, look in zip((0.8, 1.2, 1.4), looks.CASES, strict=False):
+            found = []
+            still = plan_two_step(1.0, target, MATERIAL)
+            for ratio in ratios.tolist():
+                soft = replace(MATERIAL, law=condensed(None, MATERIAL.j_lim, ratio))
+                plan = plan_two_step(1.0, target, soft)
+                stretch, _ = simulate(
+                    [0.0, still.tau_p], [still.beta_p, still.beta_1], time, soft)
+                rings = stretch[time > still.tau_p][:800]
+                found.append((
+                    100.0 * (plan.beta_1 / still.beta_1 - 1.0),
+                    100.0 * (plan.tau_p / still.tau_p - 1.0),
+                    100.0 * np.ptp(rings) / abs(target - 1.0)))
+            for axes, values in zip((left, middle, right), np.transpose(found), strict=True):
+                axes.semilogx(ratios, values, **look.line(label=f'to {target:g}'))
+        right.legend(loc='upper right')
+        ratio = style.axis('bulk over shear modulus', 'K/G')
+        style.finish(left, ratio, style.axis('change of the load', r'\beta_1', '%'), 'a')
+        style.finish(middle, ratio, style.axis('change of the time', r'\tau_p', '%'), 'b')
+        style.finish(right, ratio, style.axis('vibration', unit='% of step'), 'c')
 
 
 def creep(path: Path) -> None:
@@ -525,8 +553,8 @@ PICTURES: dict[str, Callable[[Path], None]] = {
     'demo': demo, 'adapting': adapting, 'moves': moves, 'figure_05': figure(5),
     'figure_08': figure(8), 'theory_force': force, 'theory_two_steps': two_steps,
     'theory_paths': energy, 'theory_deliveries': deliveries, 'theory_smooth': smooth,
-    'laws': laws, 'entanglements': entanglements, 'temperature': temperature, 'creep': creep,
-    'beam': beam, 'modes': modes, **STUDIES}
+    'laws': laws, 'entanglements': entanglements, 'temperature': temperature,
+    'compressibility': compressibility, 'creep': creep, 'beam': beam, 'modes': modes, **STUDIES}
 #: What draws each animation.
 ANIMATIONS: dict[str, Callable[[Path], None]] = {'moving': moving, 'modal': modal}
 

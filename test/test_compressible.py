@@ -358,7 +358,7 @@ def test_drawn_block_has_the_side_of_its_rest():
 
 # -- identification -----------------------------------------------------------------------------
 
-def recorded(actuator, stretches=(1.3, 0.7, 1.5, 1.0), seed=1, noise=1e-3):
+def recorded(actuator, stretches=(1.3, 0.7, 1.5, 1.0), seed=2, noise=1e-3):
     unit, load = actuator.time_unit, actuator.units.load
     material = actuator.nondimensional
     loads = np.append(0.0, equations.elastic_force(np.array(stretches), material))
