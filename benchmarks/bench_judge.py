@@ -31,7 +31,8 @@ KINDS = {
     'nan': 'sensor not a number', 'out': 'sensor out of range',
     'unordered': 'in no order, repeated', 'edge': 'within 20 % of the tolerance',
     'transient': 'pushed once during the hold',
-    'second': 'second mode, 1.25 to 2 tolerances', 'both': 'first and second mode'}
+    'second': 'second mode, 1.25 to 2 tolerances', 'both': 'first and second mode',
+    'damped': 'the same second mode, damping ratio 0.03 to 0.1'}
 #: Kinds in which some or all samples do not show the stretch.
 BROKEN = ('frozen', 'nan', 'out')
 TOLERANCES = Tolerances(arrival=0.02, vibration=0.02, stretch=1e-3)
@@ -45,6 +46,8 @@ _FINE = 400
 # Second modes: range of their frequencies relative to the first, samples in a period of the first,
 # and noise relative to the step.
 _RATIOS, _SAMPLES, _NOISE = (1.2, 6.5), 60, 0.003
+# Kinds of these, with the range of their damping ratios; the last two are second modes alone.
+_DAMPED = {'both': (0.0, 0.03), 'second': (0.0, 0.03), 'damped': (0.03, 0.1)}
 # Multiple of the tolerance from which a push counts as beyond it.
 _BEYOND = 1.2
 # Peak-to-peak noise in a period that is rarely exceeded, in standard deviations.
@@ -127,18 +130,18 @@ def draw(seed: int, kind: str) -> Trial:
     if kind == 'edge':
         share, off = limit * random.uniform(0.8, 1.2), random.uniform() < 0.5
         truth = replace(truth, offset=share * off, amplitude=0.5 * share * (not off))
-    if kind in ('second', 'both'):
+    if kind in _DAMPED:
         interval, noise, hold = period / _SAMPLES, _NOISE * size, max(hold, 6.0 * period)
         if kind == 'both':
             noise = size * spread(1e-5, 0.01)
         first = limit * random.uniform(0.0, 2.0) * (kind == 'both')
-        second = limit * (random.uniform(1.25, 2.0) if kind == 'second'
-                          else random.uniform(0.0, 2.0))
+        second = limit * (random.uniform(0.0, 2.0) if kind == 'both'
+                          else random.uniform(1.25, 2.0))
         truth = Truth(
             0.0, 0.5 * first, random.uniform(0.0, 2.0 * math.pi),
-            model * random.uniform(0.85, 1.1), model * random.uniform(0.0, 0.03), 0.0, 1.0,
+            model * random.uniform(0.85, 1.1), model * random.uniform(*_DAMPED[kind]), 0.0, 1.0,
             0.5 * second, spread(*_RATIOS))
-        if kind == 'second':
+        if kind != 'both':
             # Peak to peak, whatever its phase and decay.
             shown = np.ptp(truth.vibrates(np.linspace(0.0, hold, 40 * _SAMPLES)))
             truth = replace(truth, second=0.5 * second**2 / float(shown))

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.special import stdtrit
 
+from benchmarks.bench_judge import draw, verdict_of
 from hmsa.judge.fit import student_quantile
 from hmsa.judge.judging import judge
 from hmsa.judge.records import missed, RequestedSetpoint, SensorModel, Tolerances, worst
@@ -155,6 +156,27 @@ def test_a_vibration_that_begins_while_it_is_held_is_not_arrived(begin):
 def test_all_samples_count_however_many_there_are():
     assert judge(*held(noise=4.0, seconds=0.1), setpoint()).verdict == 'undecided'
     assert judge(*held(noise=4.0, seconds=0.1, rate=100_000), setpoint()).arrived
+
+
+@pytest.mark.parametrize(('kind', 'most'), [('second', 0.1), ('damped', 0.2)])
+def test_second_modes_above_the_tolerance_are_seen_and_never_taken_for_rest(kind, most):
+    found = [verdict_of(draw(seed, kind)) for seed in range(1000, 1100)]
+    assert set(found) <= {'vibrating', 'undecided'}
+    assert found.count('undecided') <= most * len(found)
+
+
+def test_less_noise_or_more_samples_never_make_a_second_mode_undecided():
+    random = np.random.default_rng(5)
+    for seed in range(12):
+        mode = random.uniform(2.5, 4.0), random.uniform(1.2, 6.5), random.uniform(0.0, 0.05)
+        for changes in (
+                [{'noise': x} for x in (1.0, 0.3, 0.1, 0.01, 1e-4, 1e-6)],
+                [{'rate': x} for x in (1250, 2500, 5000, 10_000, 20_000)]):
+            verdicts = [str(judge(*ringing(
+                mode, seed=seed, **{'noise': 0.3, **x}), setpoint(
+                    end=200 * MS)).verdict) for x in changes]
+            first = next((i for i, x in enumerate(verdicts) if x != 'undecided'), len(verdicts))
+            assert 'undecided' not in verdicts[first:], (mode, changes, verdicts)
 
 
 @pytest.mark.parametrize('seconds', [0.025, 0.08])

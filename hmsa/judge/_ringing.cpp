@@ -757,9 +757,12 @@ Found bounds(const Problem &problem, const std::vector<Base> &bases, const Array
     }
     found.offset = {best.offset, unit * std::sqrt(best.offset_variance), infinity, -infinity};
     found.vibration = {0.0, 0.0, infinity, -infinity};
+    // A vibration found only by the search is not significant, but possible. The more certain it
+    // is, the fewer frequencies compete with its own.
+    const double shown = (bases[best.base].squares - best.squares) / std::max(scale, 1e-300),
+                 rivals = searched * std::min((certain + searched) / std::max(shown, 1e-300), 1.0);
     for (const auto &[slack, x] : possible) {
-        // A vibration found only by the search is not significant, but possible.
-        const double reach = std::sqrt(std::max(slack, 0.0) * scale),
+        const double reach = std::sqrt(std::max(slack - searched + rivals, 0.0) * scale),
                      near = std::sqrt(std::max(slack - searched, 0.0) * scale);
         double swing, deviation = std::sqrt(x->pair_variance) * factor_of(x->wave());
         if (problem.modes.empty()) {
@@ -773,7 +776,9 @@ Found bounds(const Problem &problem, const std::vector<Base> &bases, const Array
             found.vibration.value = swing;
             found.vibration.deviation = unit * deviation;
         }
-        found.vibration.low = std::min(found.vibration.low, swing - reach * deviation);
+        if (slack >= searched - rivals) {
+            found.vibration.low = std::min(found.vibration.low, swing - reach * deviation);
+        }
         if (slack >= searched) {
             found.offset.low = std::min(found.offset.low, x->offset - near * shift);
             found.offset.high = std::max(found.offset.high, x->offset + near * shift);
