@@ -76,11 +76,11 @@ def judge(
         only serve to check the sensor.
     stretch : array
         Measured stretch, shape (n,); NaN for missing values.
-    setpoint : Setpoint
+    setpoint : RequestedSetpoint
         The setpoint as requested.
     tolerances : Tolerances
         Tolerances for an arrival.
-    sensor : Sensor
+    sensor : SensorModel
         Known properties of the sensor.
 
     Returns

@@ -74,7 +74,7 @@ def plan_sequence(
     ----------
     setpoints : sequence of Setpoint
         At least one.
-    frame : Request or NondimensionalParameters
+    frame : MoveRequest or NondimensionalParameters
         Common data of all moves, with the initial state; or only a material, to start at rest
         without a field on ideal hardware. With a command period, durations must be multiples of
         it. Each move starts from the state that the rounded command reaches.

@@ -1,8 +1,9 @@
 """
 Shapers, which command one move, in a registry by name.
 
-A shaper takes a `Request` and returns a `Move`, or raises `RefusedError` with a reason. All
-quantities are dimensionless; `Units` only format the messages.
+A shaper takes a `MoveRequest` and returns a `Move`, whose first level is at time 0, or raises
+`RefusedError` with a reason. All quantities are dimensionless: a time in s is divided by
+``request.units.time``, and else `Units` only format the messages.
 """
 
 import math
