@@ -526,7 +526,7 @@ def test_two_clocks_are_told_of_and_their_quarrel_makes_no_storm(rig, make_ros):
     planner.spin(
         lambda: any('2 publishers on /clock' in x.status[0].message for x in arrays),
         'diagnostics')
-    assert planner.runtime.following.replanned == 0
+    assert planner.runtime.deviations.replanned == 0
     assert sum(
         x.values[0].value == 'clock_jumped' for x in planner.statuses[before:]) < 10
 

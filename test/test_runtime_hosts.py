@@ -624,7 +624,7 @@ def test_a_planner_with_a_plan_to_replace_rests_while_its_device_is_away():
     rig.run(START + 400 * MS)
     rig.linked = False
     rig.run(START + 2000 * MS)
-    rig.runtime.following.replan('a')
+    rig.runtime.deviations.replan('a')
     assert rig.runtime.wake > rig.now
 
 

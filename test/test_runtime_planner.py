@@ -323,7 +323,7 @@ def test_long_trajectory_is_planned_beside_the_loop_with_signs_of_life_in_betwee
     assert {y.since - x.since for x, y in zip(segments, segments[1:], strict=False)} == {HOLD}
     rig.run(segments[2].since)
     assert rig.residual(segments[1].stretch) < 0.1 * RESIDUAL
-    assert rig.runtime.following.lateness.count == 0
+    assert rig.runtime.deviations.lateness.count == 0
 
 
 def test_stop_is_answered_at_once_whatever_is_planned():

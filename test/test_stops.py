@@ -158,7 +158,7 @@ def test_the_lost_levels_of_a_stop_are_planned_anew_only_once_the_device_is_hear
     rig.mute = True
     rig.run(rig.now + SECOND)
     assert rig.runtime.devices.receipts.silent
-    assert rig.runtime.following.astray
+    assert rig.runtime.deviations.astray
     count = len(rig.sent)
     rig.run(rig.now + 25 * SECOND, step=20 * MS)
     assert len(rig.sent) == count

@@ -37,9 +37,9 @@ class CommandLink:
     """
 
     def __init__(
-            self, planners: Mapping[str, Planner], receipts: Receipts, following: Deviations,
+            self, planners: Mapping[str, Planner], receipts: Receipts, deviations: Deviations,
             takeover: Takeover, environment: Environment, outputs: list[Output]) -> None:
-        self._planners, self._following, self._takeover = planners, following, takeover
+        self._planners, self._deviations, self._takeover = planners, deviations, takeover
         self.receipts, self._around = receipts, environment
         #: Delivers a command immediately, before any other work.
         self.deliver: Callable[[Send], None] = outputs.append
@@ -82,7 +82,7 @@ class CommandLink:
             if name in silent | self.apart | self.cut:
                 # The command would arrive too late, apply at another time, or be rejected.
                 continue
-            if name in self._void and name in self._following.astray or self._following.lost(name):
+            if name in self._void and name in self._deviations.astray or self._deviations.lost(name):
                 # The plan is for another state, and is being replaced.
                 continue
             self._void.discard(name)
@@ -91,7 +91,7 @@ class CommandLink:
                 self._hand_out(name, level.stamp, level.flux_density, now)
                 self.receipts.expect(name, level.stamp)
                 self.sent += 1
-                self._following.sent(name, level.stamp, now)
+                self._deviations.sent(name, level.stamp, now)
 
     def _hand_out(self, name: str, stamp: int, flux_density: float, now: int) -> None:
         self.deliver(Send(name, stamp, flux_density))
@@ -111,19 +111,19 @@ class CommandLink:
             if name in self.receipts.silent | self.cut | self.fresh | self.apart:
                 # The last level is not meant for this device.
                 continue
-            if self._following.doubts(name):
+            if self._deviations.doubts(name):
                 continue
             stamp, following = planner.beat_stamp(now), planner.next_stamp
             level = planner.last_sent.flux_density
-            lost = self._following.lost(name)
-            if (finds_lost and not lost and name in self._following.newest
+            lost = self._deviations.lost(name)
+            if (finds_lost and not lost and name in self._deviations.newest
                     and self.receipts.owed(name) and planner.awaiting_change):
                 continue
             if lost:
                 if stamp <= planner.last_sent.stamp:
                     # It would replace the last level, which is on its way.
                     continue
-                level = self._following.newest.get(name, (0, level))[1]
+                level = self._deviations.newest.get(name, (0, level))[1]
             if lost or following is None or stamp < following:
                 self._hand_out(name, stamp, level, now)
                 self.heartbeats += 1
@@ -138,7 +138,7 @@ class CommandLink:
         steady, now, stamp = (
             self._around.steady(), self._around.clock(), self._cut_at.get(joint, 0))
         off = joint not in self.open if joint in self.locked else (
-            self._following.newest.get(joint, (0, math.nan))[1] == 0.0)
+            self._deviations.newest.get(joint, (0, math.nan))[1] == 0.0)
         if joint in self.apart:
             # No heartbeat would follow, and it would be cut off again.
             return
@@ -157,7 +157,7 @@ class CommandLink:
             self._reporters[joint] = now or before
             if before and now - before:
                 # Another device took over, before its first receipt or without receipts.
-                self._following.newest.pop(joint, None)
+                self._deviations.newest.pop(joint, None)
             elif before or joint not in absent:
                 # A known device that is back after an outage is not new. Discovery of a first
                 # device finds one topic after the other.
@@ -175,7 +175,7 @@ class CommandLink:
             comparable=not self._around.one_clock())
         if not restarted:
             return None
-        self._following.newest.pop(joint, None)
+        self._deviations.newest.pop(joint, None)
         return self._appeared(joint)
 
     def _appeared(self, joint: str) -> Verdict | None:
@@ -222,7 +222,7 @@ class CommandLink:
             return None
         if settings.after_cut_off == 'resume' and not locked:
             self._takeover.doubt(joint)
-            self._following.replan(joint)
+            self._deviations.replan(joint)
             self._void.add(joint)
             return None
         planned = bool(self._planners[joint].plan.segments)
@@ -316,19 +316,19 @@ class CommandLink:
 
         The level in force, from now on by its clock, replaces all later ones.
         """
-        level = self._following.newest.get(joint)
+        level = self._deviations.newest.get(joint)
         if level is not None and self._takeover.engaged and joint not in self.cut | self.open:
             self._hand_out(joint, now + offset.ahead, level[1], now)
 
     def _restart_times(self, joint: str) -> None:
         """Discard times of a device's clock from before it was set."""
         self._takeover.forget(joint)
-        self._following.forget_times(joint)
+        self._deviations.forget_times(joint)
 
     def _dropped(self, joint: str, code: Code, words: str) -> Verdict:
         """Have the next request start from a sample; return the verdict on a dropped plan."""
         self._takeover.doubt(joint)
-        self._following.astray.discard(joint)
+        self._deviations.astray.discard(joint)
         return Verdict(
             Severity.ERROR, code,
             f'{words}, and the next request starts from where the actuator is then')
@@ -346,18 +346,18 @@ class CommandLink:
             If commands have not arrived, or a cut-off has lasted, for a long time.
 
         """
-        names = self._following.astray
+        names = self._deviations.astray
         for joint in self.cut:
             self.acknowledge(joint)
         # After a loss, a heartbeat shows whether commands arrive again.
         lost = [x for x in self._planners if self.receipts.lost(
-            x, *((0,) if x in self.cut or self._following.lost(x) else ()))]
+            x, *((0,) if x in self.cut or self._deviations.lost(x) else ()))]
         # Asking the middleware takes far longer than looking up.
         owed = any(
             not self.receipts.knows(x) and self._around.reports(x) for x in self._planners)
         if not (lost or self.cut or owed) and all(
                 level[1] != 0.0 or self.receipts.since(name, level[0])
-                for name, level in self._following.newest.items() if name in names):
+                for name, level in self._deviations.newest.items() if name in names):
             self.since = None
             return False
         if self.since is None:

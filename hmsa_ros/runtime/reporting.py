@@ -34,11 +34,11 @@ class Reporting:
     """Verdicts, progress, previews and notes that wait to be published."""
 
     def __init__(
-            self, group: PlannerGroup, following: Deviations, watch: ArrivalMonitor,
+            self, group: PlannerGroup, deviations: Deviations, watch: ArrivalMonitor,
             environment: Environment, outputs: list[Output], note: Callable[[str], None],
             *looks: Callable[[], str]) -> None:
         """Begin without a verdict; ``looks`` return the values of `unheard` and `unseen`."""
-        self._group, self._following, self._watch = group, following, watch
+        self._group, self._deviations, self._watch = group, deviations, watch
         self._around, self._looks = environment, looks
         self.outputs, self.note = outputs, note
         self._look_again = 0
@@ -86,8 +86,8 @@ class Reporting:
     def report(self) -> None:
         """Have verdict and progress reported by `flush`."""
         self._pending.append((
-            self.verdict, self._group.number, self._following.lateness.count,
-            self._following.replanned))
+            self.verdict, self._group.number, self._deviations.lateness.count,
+            self._deviations.replanned))
 
     @property
     def pending(self) -> bool:

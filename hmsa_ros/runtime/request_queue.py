@@ -58,11 +58,11 @@ class RequestQueue:
     """Have waiting requests planned, and report the results."""
 
     def __init__(
-            self, group: PlannerGroup, following: Deviations, follower: Follower,
+            self, group: PlannerGroup, deviations: Deviations, follower: Follower,
             temperatures: Temperatures, reporting: Reporting, environment: Environment,
             send: Callable[[int], None], stopping: Callable[[str], None]) -> None:
         """Begin without requests; ``stopping`` is called with the name of an adopted stop."""
-        self._group, self._following, self._reporting = group, following, reporting
+        self._group, self._deviations, self._reporting = group, deviations, reporting
         #: Follows the joints; feedback may take its place.
         self.follower = follower
         #: Temperatures of the joints, for which plans are made.
@@ -109,11 +109,11 @@ class RequestQueue:
         if isinstance(request, Trajectory):
             work = _of_trajectory(request, self._group)
         elif isinstance(request, StretchRequest):
-            work = PlanningTask(frozenset([request.joint]), partial(
+            work = PlanningTask(frozenset([request.joint]), at_once=partial(
                 self._group.draft_setpoint, request.joint, request.stretch), request=request)
         else:
             work = PlanningTask(
-                frozenset(self._group.planners), self._group.draft_stop, request=request)
+                frozenset(self._group.planners), at_once=self._group.draft_stop, request=request)
         if engaged and work.replaces(self._queue):
             self._queue.appendleft(work)
         else:
@@ -133,9 +133,9 @@ class RequestQueue:
 
     def work_on(self) -> None:
         """Wait for the plans of waiting work, for the duration of a slice."""
-        for name in self._following.to_resume() if self._following.astray else ():
+        for name in self._deviations.to_resume() if self._deviations.astray else ():
             if not any(x.request is None and name in x.joints for x in self._queue):
-                self._queue.appendleft(self._following.resumption(name))
+                self._queue.appendleft(self._deviations.resumption(name))
         if not self._queue:
             self._queue += self.follower.due(self._around.clock())
             self._queue += self.temperatures.due(self._around.clock())
@@ -145,8 +145,8 @@ class RequestQueue:
             work = self._queue[0]
             if self.advance(work, left) and work in self._queue:
                 self._queue.remove(work)
-        while self._following.verdicts:
-            self._reporting.go_on(self._following.verdicts.pop(0))
+        while self._deviations.verdicts:
+            self._reporting.go_on(self._deviations.verdicts.pop(0))
 
     def advance(self, work: PlanningTask, wait: int = SLICE) -> bool:
         """Continue work for some ns; return whether it is done."""
@@ -158,7 +158,7 @@ class RequestQueue:
             if work.corrects:
                 self._reporting.note(f'plan not corrected: {error}')
             elif work.request is None:
-                self._reporting.go_on(self._following.abandon(work, error), log=True)
+                self._reporting.go_on(self._deviations.abandon(work, error), log=True)
             else:
                 self.refuse(error, work.request)
             return True
@@ -233,7 +233,7 @@ class RequestQueue:
         """Start to carry out a request."""
         # What is still to be reported concerns the plans of before.
         self._reporting.flush()
-        self._following.dropped(drafts)
+        self._deviations.dropped(drafts)
         plans = self._group.take(drafts, now)
         # Commands are sent first, since reporting takes time.
         self._send(self._around.clock())
@@ -268,7 +268,7 @@ class RequestQueue:
             work.take(drafts, now)
             self._send(self._around.clock())
             return
-        by = self.follower if work.corrects else self._following
+        by = self.follower if work.corrects else self._deviations
         verdict = by.take(work, drafts, now)
         self._send(self._around.clock())
         if verdict is None:
@@ -278,7 +278,7 @@ class RequestQueue:
         else:
             self._reporting.show()
         self._reporting.go_on(
-            verdict, log=not work.corrects and self._following.replanned_due())
+            verdict, log=not work.corrects and self._deviations.replanned_due())
 
 
 def _accepted(drafts: Mapping[str, Draft]) -> tuple[Severity, Code, str]:

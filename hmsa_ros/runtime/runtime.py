@@ -80,25 +80,25 @@ class Runtime:
         self._clock, self._steady = clock, around.steady
         self._outputs: list[Output] = []
         receipts = Receipts(around.steady)
-        self.following = Deviations(group, receipts, self._note)
+        self.deviations = Deviations(group, receipts, self._note)
         self.follower = Follower(group, settings)
         self._takeover = Takeover(
-            group.planners, around, receipts, self.following.newest,
+            group.planners, around, receipts, self.deviations.newest,
             self._follows, self._note)
         self._silence = SampleTimeout(around)
         self._watch = ArrivalMonitor(group, around, self.follower, self._outputs.append)
         self.devices = CommandLink(
-            group.planners, receipts, self.following, self._takeover, around, self._outputs)
+            group.planners, receipts, self.deviations, self._takeover, around, self._outputs)
         self._reporting = Reporting(
-            group, self.following, self._watch, around, self._outputs, self._note,
+            group, self.deviations, self._watch, around, self._outputs, self._note,
             lambda: around.unheard() or receipts.words, self._unseen)
         self._stops = Stops(
-            group, self.devices, self.following.newest, self._watch, around, around.unheard,
+            group, self.devices, self.deviations.newest, self._watch, around, around.unheard,
             lambda: self.settings.tolerances)
         self.devices.stops = lambda: self._stops.judges
         self.temperatures = Temperatures(group, lambda: self.settings, clock, self._note)
         self.planning = RequestQueue(
-            group, self.following, self.follower, self.temperatures, self._reporting, around,
+            group, self.deviations, self.follower, self.temperatures, self._reporting, around,
             self.devices.send, self._stops.begin)
         self._follow()
         self._next_beat = 0  # time in ns of the next heartbeat
@@ -163,7 +163,7 @@ class Runtime:
         if not isinstance(request, Stop):
             if self._takeover.engaged:
                 self._compare_samples(request)
-            self.following.asked(request.joints)
+            self.deviations.asked(request.joints)
         work = self.planning.add(request, engaged=self._takeover.engaged)
         self._engage(begin=True)
         while self._may_plan():
@@ -206,7 +206,7 @@ class Runtime:
         the time of the cut-off; one that is locked by an interlock rejects all. It has rejected
         this command if it was too ``late``.
         """
-        self.following.seen(time)
+        self.deviations.seen(time)
         self._unheard.discard(joint)
         self._drop(self.devices.received(
             joint, time, None if cut_off else command, late=late))
@@ -267,7 +267,7 @@ class Runtime:
             now = self._clock()
         if joint in self.devices.apart or not self.devices.receipts.is_past(joint, stamp, now):
             # The clock of the device was set, and the time is unknown.
-            self.following.newest[joint] = 0, flux_density
+            self.deviations.newest[joint] = 0, flux_density
             if joint in self.devices.apart and self._takeover.engaged:
                 # Its plan is dropped. The level applies by now, until a request replaces it.
                 self.group.applied(
@@ -275,9 +275,9 @@ class Runtime:
             return
         self.follower.applied(joint, stamp, flux_density)
         if self._takeover.engaged:
-            self.following.applied(joint, stamp, flux_density, self.settings, now)
+            self.deviations.applied(joint, stamp, flux_density, self.settings, now)
         else:
-            self.following.newest[joint] = stamp, flux_density
+            self.deviations.newest[joint] = stamp, flux_density
 
     def observed(
             self, joint: str, stamp: int, stretch: float, rate: float,
@@ -326,7 +326,7 @@ class Runtime:
             return
         requests = [] if back else self.planning.requests
         self.planning.clear()
-        self.following.restart(levels=not back)
+        self.deviations.restart(levels=not back)
         self.follower.restart()
         self.devices.receipts.clock_set()
         self._silence.restart()
@@ -404,7 +404,7 @@ class Runtime:
 
     def looks_at(self, stamp: int) -> bool:
         """Return whether a sample with a timestamp in ns is needed; most are not."""
-        self.following.seen(stamp, sampled=True)
+        self.deviations.seen(stamp, sampled=True)
         return (self._takeover.waiting or self._watch.wants(stamp)
                 or self.follower.wants(stamp))
 
@@ -424,9 +424,9 @@ class Runtime:
             self.follower.wake]
         if self.settings.heartbeat_period:
             times.append(self._next_beat)
-        if self.following.astray - self.devices.receipts.silent or self.following.verdicts:
+        if self.deviations.astray - self.devices.receipts.silent or self.deviations.verdicts:
             times.append(0)
-        if self.following.advises:
+        if self.deviations.advises:
             times.append(now + LOOK)
         if self.devices.receipts or self._stops.open:
             times.append(now + LOOK)
@@ -482,7 +482,7 @@ class Runtime:
         if self._reporting.preview_again is not None and now >= self._reporting.preview_again:
             self._reporting.show()
         self._reporting.report_progress(now)
-        self.following.advise()
+        self.deviations.advise()
         if self.active and (
                 self._watch.open or self._reporting.unheard or self._reporting.unseen
                 or self.devices.receipts or self._reporting.next_change is not None):
@@ -501,19 +501,19 @@ class Runtime:
             return False
         self.devices.look()
         if self.settings.replan_late:
-            self.following.drop_missed(now, self.settings.lateness_tolerance)
-        if self.following.astray and self._may_plan():
+            self.deviations.drop_missed(now, self.settings.lateness_tolerance)
+        if self.deviations.astray and self._may_plan():
             # Replan before more of a plan is sent that no longer applies.
             self.planning.work_on()
-        late = self.following.lateness.count
+        late = self.deviations.lateness.count
         self.devices.send(now)
-        if self.following.lateness.count > late:
+        if self.deviations.lateness.count > late:
             self.follower.give_way(now)
         if self.settings.heartbeat_period and now >= self._next_beat:
             # Heartbeats, and a check which devices report.
             self._next_beat = now + self.settings.heartbeat_period
             if self.settings.replan_late:
-                self.following.look_for_unheard(now)
+                self.deviations.look_for_unheard(now)
             self._drop(self.devices.look_for_newcomers())
             self.devices.beat(now, finds_lost=self.settings.replan_late)
         return True
@@ -551,7 +551,7 @@ class Runtime:
         if self._listens() or not self._takeover.engaged:
             return False
         request = self.planning.upcoming
-        if isinstance(request, Stop) or request is None and not self.following.astray:
+        if isinstance(request, Stop) or request is None and not self.deviations.astray:
             # A stop does not wait.
             return True
         try:
@@ -588,13 +588,13 @@ class Runtime:
 
     def report(self) -> tuple[Severity, str, dict[str, object]]:
         """Return the state of the commands: severity, message and counters."""
-        late, severity, message = self.following.lateness, Severity.OK, 'commands sent in time'
+        late, severity, message = self.deviations.lateness, Severity.OK, 'commands sent in time'
         receipts, clocks = self.devices.receipts, self.devices.clocks
         if cold := self.temperatures.look():
             severity, message = Severity.WARN, cold
         if late.count:
-            severity = Severity.WARN if late.harms or self.following.clocks else Severity.OK
-            message = f'{late.count} commands late: {self.following.advice}'
+            severity = Severity.WARN if late.harms or self.deviations.clocks else Severity.OK
+            message = f'{late.count} commands late: {self.deviations.advice}'
         elif clocks:
             severity, message = Severity.WARN, clocks
         if self.active:
@@ -611,7 +611,7 @@ class Runtime:
             'clock_offset_ms': f'{offset.ahead / 1e6:.3f}',
             'clock_offset_error_ms': f'{offset.error / 1e6:.3f}'}
         return severity, message, {
-            'sent': self.devices.sent, 'late': late.count, 'replanned': self.following.replanned,
+            'sent': self.devices.sent, 'late': late.count, 'replanned': self.deviations.replanned,
             'heartbeats': self.devices.heartbeats,
             'largest_lateness_ms': f'{late.largest / 1e6:.3f}',
             'refused': self.planning.refused, 'clock_jumps': self.clock_jumps,
