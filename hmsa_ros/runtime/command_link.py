@@ -82,7 +82,8 @@ class CommandLink:
             if name in silent | self.apart | self.cut:
                 # The command would arrive too late, apply at another time, or be rejected.
                 continue
-            if name in self._void and name in self._deviations.astray or self._deviations.lost(name):
+            deviations = self._deviations
+            if name in self._void and name in deviations.astray or deviations.lost(name):
                 # The plan is for another state, and is being replaced.
                 continue
             self._void.discard(name)
