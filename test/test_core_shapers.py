@@ -1,10 +1,12 @@
 """Shapers against an independent integration: at rest at the target, or a reason."""
 
 from collections import Counter
+from contextlib import suppress
 from dataclasses import replace
 import math
 import re
 
+from conftest import ROOT
 from hypothesis import example, given, HealthCheck, settings
 from hypothesis import strategies as st
 import numpy as np
@@ -12,6 +14,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from hmsa import motion
+from hmsa.cli import main
 from hmsa.errors import BadInputError
 from hmsa.model.creep import Creep
 from hmsa.model.delivery import Delivery, ramps
@@ -30,6 +33,7 @@ from hmsa.planning.planner import Options, Planner
 from hmsa.planning.sequence import plan_sequence
 from hmsa.planning.shapers import get_shaper, SHAPERS
 from hmsa.planning.shapers.request import MoveRequest
+from hmsa.report import looks
 
 PAPER = NondimensionalParameters()
 WIDE = Limits(-20.0, 20.0)
@@ -323,6 +327,16 @@ def test_a_refusal_costs_no_more_than_its_searches_and_one_for_advice(monkeypatc
     with pytest.raises(RefusedError, match='expected no flux density limits and no slew limit'):
         get_shaper('minimum_time')(request)
     assert sum(spent) < 700_000
+
+
+def test_every_shaper_has_a_style_and_is_named_where_one_is_chosen(capsys):
+    assert looks.SHAPERS.keys() == SHAPERS.keys()
+    with suppress(SystemExit):
+        main(['plan', '--help'])
+    told, page = capsys.readouterr().out, (ROOT / 'docs/explanation/which-shaper.md').read_text()
+    for name in SHAPERS:
+        assert re.search(rf'\b{name}\b', told), name
+        assert f'`{name}`' in page, name
 
 
 @pytest.mark.parametrize('name', list(SHAPERS))
