@@ -45,6 +45,8 @@ def spin(nodes: Sequence[Node], ending: Callable[[], bool]) -> None:
             ended.set_result(None)
     timer = nodes[0].create_timer(
         _LOOK_SECONDS, look, clock=Clock(clock_type=ClockType.STEADY_TIME))
+    # A managed node destroys what it has created since it was configured.
+    getattr(nodes[0], 'keep', lambda *entities: None)(timer)
     try:
         while context.ok() and not ended.done():
             executor.spin_until_future_complete(ended, _SLICE_SECONDS)
