@@ -869,7 +869,7 @@ def test_a_worker_that_is_to_reconnect_goes_on_from_zero_once_the_cable_is_in_ag
         with pytest.raises(BadInputError, match='no device'):
             worker.receive(1, 0, 0.2)
         cable.out = False
-        wait_until(lambda: 'the coil is switched off, and what was' in worker.trouble, 'the off')
+        wait_until(lambda: 'the coil is switched off, and all' in worker.trouble, 'the off')
         # Time enough for a planner to hear of it; then 0 T comes first.
         wait_until(lambda: worker.look_after() or not worker.trouble, 'the end of it')
         assert worker.device.cut_offs == [0, 1]
