@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from hmsa.planning.drafting import Check
 from hmsa.planning.planner import Planner
 from hmsa.planning.timeline import Draft
-from hmsa_ros.runtime.records import Request, Trajectory
+from hmsa_ros.runtime.records import Request, Trajectory, Verdict
 from hmsa_ros.runtime.worker import Job
 
 #: Drafts by joint.
@@ -40,8 +40,8 @@ class PlanningTask:
     read: Callable[[Check], None] | None = None
     number: int = field(default_factory=count().__next__)  # increases with each work
     corrects: bool = False  # whether it is a correction from samples or a temperature
-    #: Adopts the drafts of a correction in place of feedback, for a time in ns.
-    take: Callable[[Drafts, int], None] | None = None
+    #: Adopts the drafts of a correction in place of feedback, as `Follower.take`.
+    take: 'Callable[[PlanningTask, Drafts, int], Verdict | None] | None' = None
     spent: int = 0  # time spent on a correction, in ns
     job: Job | None = None  # what the worker does
     complete: Callable[[Drafts], Drafts] = dict

@@ -264,12 +264,8 @@ class RequestQueue:
 
     def _go_on(self, work: PlanningTask, drafts: Mapping[str, Draft], now: int) -> None:
         """Adopt a plan that was replanned, or corrected from samples."""
-        if work.take is not None:
-            work.take(drafts, now)
-            self._send(self._around.clock())
-            return
-        by = self.follower if work.corrects else self._deviations
-        verdict = by.take(work, drafts, now)
+        take = work.take or (self.follower if work.corrects else self._deviations).take
+        verdict = take(work, drafts, now)
         self._send(self._around.clock())
         if verdict is None:
             return

@@ -123,7 +123,7 @@ class Temperatures:
                 self._again[joint] = now + _PAUSE
                 work = replanning(
                     joint, self._group.planners[joint], partial(self._anew, joint), corrects=True)
-                work.take = self._take
+                work.take = self.take
                 yield work
 
     def _anew(self, joint: str, now: int) -> Replanning | None:
@@ -133,7 +133,8 @@ class Temperatures:
         return Replanning(
             partial(_warmed, now=now), starts=(begin, *(x.since for x in following)))
 
-    def _take(self, drafts: Drafts, now: int) -> None:
+    def take(self, work: PlanningTask, drafts: Drafts, now: int) -> None:
+        """Adopt a plan made again for a time in ns; there is nothing to report."""
         for joint, draft in drafts.items():
             self._group.planners[joint].take(draft, now)
             self.followed += 1
