@@ -57,8 +57,8 @@ class Belief:
         """Return the values at a temperature in degrees Celsius."""
         actuator, others = self.actuator.at_temperature(temperature), dict(self.others)
         if 'coil_time_constant' in others:
-            others['coil_time_constant'] /= self.actuator.thermal.factor(
-                'coil_resistance', temperature)
+            others['coil_time_constant'] = self.actuator.thermal.coil_time_constant(
+                others['coil_time_constant'], temperature)
         return replace(self, actuator=actuator, others=others)
 
     def number(self, name: str, default: float) -> float:

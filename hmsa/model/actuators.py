@@ -72,8 +72,9 @@ class Setup:
         if actuator is self.actuator:
             return self
         return replace(
-            self, actuator=actuator, coil_time_constant=self.coil_time_constant
-            / self.actuator.thermal.factor('coil_resistance', temperature))
+            self, actuator=actuator,
+            coil_time_constant=self.actuator.thermal.coil_time_constant(
+                self.coil_time_constant, temperature))
 
     def holding(self, stretch: float) -> float:
         """Return the flux density in T that holds a stretch."""

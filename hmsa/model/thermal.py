@@ -91,6 +91,10 @@ class Thermal:
                 f'the parameter is left: expected {100.0 * _LEAST:g} % or more')
         return found
 
+    def coil_time_constant(self, value: float, temperature: float) -> float:
+        """Return the time constant L/R in s at a temperature, of a ``value`` at the reference."""
+        return value / self.factor('coil_resistance', temperature)
+
     @property
     def stiffening(self) -> float:
         """Relative change, per K, of the flux density that holds a stretch."""

@@ -116,9 +116,9 @@ class JointModel:
         actuator = self.actuator.at_temperature(temperature)
         if actuator is self.actuator:
             return self
-        resistance = self.actuator.thermal.factor('coil_resistance', temperature)
         return JointModel(actuator, replace(
-            self.options, coil_time_constant=self.options.coil_time_constant / resistance))
+            self.options, coil_time_constant=self.actuator.thermal.coil_time_constant(
+                self.options.coil_time_constant, temperature)))
 
     @property
     def temperature(self) -> float:
@@ -184,7 +184,6 @@ class JointModel:
             None if state.amplifier is None else taken(state.amplifier),
             creeping.carried(
                 state, other.material, self.material, self.units.time / other.units.time))
-
 
     def held(self, taken: State, other: 'JointModel', flux_density: float) -> State:
         """
