@@ -156,7 +156,7 @@ def test_markers_are_stamped_in_the_frame_and_live_as_long_as_told():
 
 def test_block_without_a_name_is_refused():
     with pytest.raises(BadInputError, match='joint is empty'):
-        MarkerBlock('', 0.01, 0.01, 0.1)
+        MarkerBlock('', 0.01, 0.01, 0.1, ACTUATOR.side)
 
 
 def collected(ros, node):

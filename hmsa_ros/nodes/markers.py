@@ -32,9 +32,7 @@ from hmsa.errors import BadInputError
 from hmsa.interfaces import topics
 from hmsa.interfaces.actuator import actuator_from
 from hmsa.interfaces.parameters import ParameterSpec
-from hmsa.model import compressible
 from hmsa.model.laws.bending import centreline, tangent
-from hmsa.model.laws.record import Elastic
 from hmsa.model.parameters import ActuatorParameters
 from hmsa.model.units import NANOSECONDS
 from hmsa_ros.nodes import ros_entities
@@ -81,12 +79,9 @@ class MarkerBlock:
     half_length: float
     half_thickness: float
     remanence: float  #: Br in T, greater than 0
+    side: Callable[[float], float]  #: returns the transverse stretch at rest under a stretch
     per_tesla: float = 1.0  #: arrow length of the field in m/T
     width: float = 0.0  #: width of a beam in m; 0 for a block
-    #: Elastic energy of a block, whose volume is constant if the last is infinite.
-    law: Elastic | None = None
-    chain_limit: float = math.inf
-    bulk_ratio: float = math.inf
 
     def __post_init__(self) -> None:
         if not self.joint:
@@ -98,11 +93,10 @@ class MarkerBlock:
         length, thickness = actuator.half_length, actuator.half_thickness
         section = 0.0 if actuator.law is None else actuator.law.section
         return cls(
-            joint, length, thickness, actuator.remanence,
+            joint, length, thickness, actuator.remanence, actuator.side,
             per_tesla=2.0 * length / (3.0 * actuator.flux_density_unit)
             if section else thickness / actuator.remanence,
-            width=2.0 * section * length ** 2 / thickness,
-            law=actuator.law, chain_limit=actuator.chain_limit, bulk_ratio=actuator.bulk_ratio)
+            width=2.0 * section * length ** 2 / thickness)
 
     def bent(self, deflection: float) -> list[tuple[float, float, float]]:
         """
@@ -130,8 +124,7 @@ class MarkerBlock:
 
     def size(self, stretch: float) -> tuple[float, float, float]:
         """Return 2 l, 2 l and 2 h in m at a stretch."""
-        side = 2.0 * self.half_length * compressible.side(
-            stretch, self.law, self.chain_limit, self.bulk_ratio)
+        side = 2.0 * self.half_length * self.side(stretch)
         return side, side, 2.0 * self.half_thickness * stretch
 
 
