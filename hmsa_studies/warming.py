@@ -2,7 +2,7 @@
 Ten minutes of moves while the coil warms the block by 15 K, for planners that know more or less.
 
 The actuator is simulated with its temperature. The controller of the nodes moves it in simulated
-time, in open loop with or without the temperature, or with feedback that knows nothing of it.
+time, in open loop with or without the temperature, or with feedback without it.
 """
 
 from dataclasses import dataclass, replace

@@ -75,14 +75,13 @@ class CommandLink:
     def send(self, now: int, *, everything: bool = False) -> None:
         """Send the levels that are due at a time in ns, or all planned levels."""
         # Commands may arrive although nothing comes back.
-        silent = self.receipts.silent
+        silent, deviations = self.receipts.silent, self._deviations
         if silent and self.stops():
             silent = set()
         for name, planner in self._planners.items():
             if name in silent | self.apart | self.cut:
                 # The command would arrive too late, apply at another time, or be rejected.
                 continue
-            deviations = self._deviations
             if name in self._void and name in deviations.astray or deviations.lost(name):
                 # The plan is for another state, and is being replaced.
                 continue
