@@ -30,6 +30,8 @@ _ALIASES = {
     't': 'time', 'stamp': 'time', 'timestamp': 'time', 'lambda': 'stretch',
     'position': 'stretch', 'b': 'flux_density', 'flux': 'flux_density', 'field': 'flux_density',
     'effort': 'flux_density', 'deflection': 'stretch'}
+# Units whose case is not that of the tables, which are compared in lower case.
+_WRITTEN = {'t': 'T', 'mt': 'mT', 'g': 'G', 'a': 'A', 'ma': 'mA', 'v': 'V'}
 # Units of a column that needs the length at rest.
 _LENGTHS = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3, 'um': 1e-6, 'µm': 1e-6}
 _SUFFIXES = ('s', 'ms', 'us', 'ns', 't', 'mt', 'a', 'ma', 'm', 'cm', 'mm')
@@ -296,7 +298,7 @@ def _factor(path: Path, place: _Place, below: str, rest_length: float | None) ->
         return _LENGTHS[unit] / rest_length
     if unit in known or not unit:
         return known[unit or next(iter(known))]
-    expected = ', '.join(x for x in known if x)
+    expected = ', '.join(_WRITTEN.get(x, x) for x in known if x)
     if place.name == 'stretch':
         expected = 'no unit: ' + (
             _DIVIDE if unit in _LENGTHS else 'divide percent by 100, and add 1 to a strain')
@@ -307,7 +309,7 @@ def _of_another(cells: list[str]) -> str:
     """Return how to obtain a stretch from the columns of a file without one."""
     names = ' '.join(cells).lower()
     if 'strain' in names:
-        return '; stretch is strain plus 1'
+        return '; stretch is strain' + ' in percent over 100' * ('%' in names) + ' plus 1'
     return f'; for a length, {_DIVIDE}' if re.search('length|mm', names) else ''
 
 

@@ -129,12 +129,14 @@ def test_any_file_is_columns_of_numbers_or_one_sentence(tmp_path_factory, rows, 
 
 
 @pytest.mark.parametrize(('text', 'message'), [
-    ('time,flux_density\ns,furlongs\n0,1\n', 'gives flux_density in furlongs: expected t, tesla'),
+    ('time,flux_density\ns,furlongs\n0,1\n', 'in furlongs: expected T, tesla, mT, G, gauss'),
     ('time [ms],flux_density\ns,T\n0,1\n', "line 2 gives time in 's', its header in 'ms'"),
     ('time,stretch [mm]\n0,20\n', 'stretch in mm: .*at rest, .*hmsa identify --rest-length 20mm'),
     ('time,length [mm]\n0,20\n', 'no column stretch.*hmsa identify --rest-length 20mm'),
     ('time,position\ns,mm\n0,20\n', 'gives stretch in mm: expected no unit: divide it by'),
-    ('time,stretch [%]\n0,20\n', 'divide percent by 100'), ('sep=;\n', 'is empty')])
+    ('time,stretch [%]\n0,20\n', 'divide percent by 100'),
+    ('time,strain [%]\n0,20\n', 'stretch is strain in percent over 100 plus 1'),
+    ('sep=;\n', 'is empty')])
 def test_another_unit_is_refused_with_what_to_do(csv, text, message):
     wanted = WANTED if 'flux' in text else ('time', 'stretch')
     with pytest.raises(BadInputError, match=message):
