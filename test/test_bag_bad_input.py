@@ -274,6 +274,10 @@ def test_a_file_that_is_no_mcap_is_named(tmp_path, capsys):
         assert error.startswith('hmsa: error: ')
         assert expected in error
         assert error.count('\n') == 1
+    table = tmp_path / 'camera.csv'
+    table.write_text('time,stretch\n0,1\n')
+    with pytest.raises(BadInputError, match='is a table: expected a bag; hmsa identify'):
+        BagReader(table)
 
 
 def test_what_is_not_there_is_said(tmp_path, capsys):

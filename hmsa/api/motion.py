@@ -223,7 +223,7 @@ def read(path: str | Path, *, joint: str = '') -> Motion:
     Parameters
     ----------
     path : str or Path
-        Folder of a rosbag2 bag, or an ``.mcap`` file.
+        Folder of a bag, or one of its files (MCAP, SQLite or ROS 1).
     joint : str
         Actuator to read, if the bag has several.
 

@@ -24,7 +24,9 @@ def advice_on(path: Path) -> str:
         return ''
     with path.open('rb') as file:
         begin = file.read(max(len(magic) for magic, _ in _MISTAKEN))
-    return next((advice for magic, advice in _MISTAKEN if begin.startswith(magic)), '')
+    table = 'is a table: expected a bag; hmsa identify and hmsa simulate read tables'
+    return next((advice for magic, advice in _MISTAKEN if begin.startswith(magic)),
+                table * (path.suffix.lower() == '.csv'))
 
 
 def find(path: Path, problem: _Problem) -> tuple[list[Path], metadata.BagMetadata | None]:
