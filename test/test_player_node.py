@@ -320,6 +320,7 @@ def test_what_cannot_be_published_is_left_out_and_told(ros, play, tmp_path):
 def test_it_waits_for_the_subscribers_it_is_told_to(ros, play, tmp_path):
     bag = write_bag(tmp_path / 'bag', [('/a', i, i) for i in range(50)])
     process = play(bag, 'play.wait_for_subscribers:=[a]')
+    process.wait_for_output('waiting up to 60 s: no subscriber of /a')
     ros.spin_until(lambda: ros.node.count_publishers('/a'), 'the publisher')
     got = ros.collect(Float64, '/a')
     finish(ros, process, got, 50)

@@ -10,6 +10,7 @@ example: hmsa watch --joint actuator
 
 import argparse
 import json
+import sys
 from time import monotonic, sleep
 from typing import Any, TYPE_CHECKING
 
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
 # Interval of lines, and of looks in between, in s.
 _LINE_SECONDS = 1.0
 _LOOK_SECONDS = 0.1
+# Time in s of waiting after which it is said what is awaited.
+_QUIET_SECONDS = 1.0
 
 
 def add_parser(subparsers: Any) -> None:
@@ -63,12 +66,16 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _once(listener: 'Listener', arguments: argparse.Namespace) -> int:
     """Print one line once it is complete, or after the timeout."""
-    end = monotonic() + arguments.timeout
+    begin, said = monotonic(), False
     scene = listener.look()
     # At least two looks, to determine the sample rate.
     while not (scene.joints and scene.request and scene.sample_rate > 0.0):
-        if monotonic() >= end or ENDING.asked:
+        if monotonic() >= begin + arguments.timeout or ENDING.asked:
             break
+        if not said and monotonic() >= begin + _QUIET_SECONDS:
+            said = True
+            print(f'hmsa: note: waiting up to {arguments.timeout:g} s for samples and a status',
+                  file=sys.stderr, flush=True)
         sleep(_LOOK_SECONDS)
         scene = listener.look()
     _print(scene, arguments.json)

@@ -13,6 +13,7 @@ it is active, and releases both when it is cleaned up.
 
 from collections.abc import Iterable, Mapping, Sequence
 import contextlib
+import math
 import os
 import sys
 import threading
@@ -46,6 +47,8 @@ _ACKNOWLEDGED_SECONDS = 0.5
 # Discovery may take three seconds, the period of participant announcements. Later subscribers are
 # not waited for.
 _DISCOVERY_SECONDS = 3.5
+# Time in s of waiting after which it is said what is awaited.
+_QUIET_SECONDS = 1.0
 # Of the sending thread: precise timing on a busy machine needs it.
 _REALTIME_PRIORITY = 1
 # Limit of builtin_interfaces/Time.
@@ -269,7 +272,7 @@ class Player(ManagedNode):
         """Wait until the required subscribers are present."""
         begin = next_clock = time.monotonic()
         timeout = self._values['play.wait_for_subscribers_timeout']
-        settled = begin + _DISCOVERY_SECONDS
+        settled, quiet = begin + _DISCOVERY_SECONDS, begin + _QUIET_SECONDS
         while not transport.rest(_POLL_SECONDS):
             now = time.monotonic()
             if self._clock_out is not None and now >= next_clock:
@@ -278,6 +281,11 @@ class Player(ManagedNode):
             missing = self._audience.missing()
             if not missing and (now >= settled or self._audience.found(self._clock_publisher)):
                 return
+            if now >= quiet:
+                quiet = math.inf
+                self.get_logger().info(
+                    f'waiting up to {timeout:g} s: no {", no ".join(missing)}' if missing else
+                    f'waiting up to {_DISCOVERY_SECONDS:g} s for subscribers')
             if missing and now >= begin + timeout:
                 raise HmsaError(
                     f'no {", no ".join(missing)} within {timeout:g} s: expected one; start it, '
