@@ -74,7 +74,7 @@ def _carry_out(
         x[-1][0] for x in (levels, path) if x)
     if (pace := client.pace()) < SLOW:
         print(
-            f'simulated time runs at {pace:.2g} of real time: the sequence of {length:g} s takes '
+            f'simulated time runs at {pace:.3g} of real time: the sequence of {length:g} s takes '
             f'about {length / pace:.2g} s', file=sys.stderr, flush=True)
     verdict = client.send(arguments.setpoints, levels, path)
     print(verdict.message, flush=True)

@@ -164,7 +164,7 @@ class Stopping:
         if self.failure is not None:
             return self.failure
         if self._sent == -math.inf:
-            return f'waiting for {self._link.planner}, to stop it'
+            return f'waiting up to {self._link.timeout:g} s for {self._link.planner}, to stop it'
         return f'waiting for {self._link.planner} to answer the stop' if (
             self._verdict is None) else 'stopping: waiting for plant or driver to acknowledge it'
 
