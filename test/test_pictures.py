@@ -14,10 +14,12 @@ import pytest
 from scipy.integrate import solve_ivp
 from test_report import ACTUATOR, one, parameters, simulated
 
+from hmsa import Actuator
 from hmsa.errors import BadInputError
 from hmsa.interfaces.topics import FLUX_DENSITY_COMMAND
 from hmsa.model.residual import percent
 from hmsa.report import style
+from hmsa.report.arrivals import Part
 from hmsa.report.bands import draw_bands
 from hmsa.report.charts import commanded, PANELS
 from hmsa.report.curves import decimate, through, TimeCurve
@@ -239,6 +241,17 @@ def test_a_panel_on_paper_and_in_a_page_shows_the_same(
             assert line.get_color() == curve['colour']
             assert np.asarray(line.get_ydata(), dtype=float) == pytest.approx(
                 np.array(curve['y'], dtype=float), nan_ok=True)
+
+
+def test_the_plan_looks_alike_in_all_panels_and_like_nothing_else() -> None:
+    block = Actuator(damping_ratio=0.04)
+    motion = block.plan([(1.1, 0.5), (1.0, 0.5)]).simulate(
+        truth=block.scaled(shear_modulus=1.05))
+    curves = [x for name in ('response', 'error') for panel in PANELS[name]([Part.of(motion.run)])
+              for x in panel.curves]
+    looks = {(x.look.colour, x.look.dash) for x in curves if x.name == 'plan'}
+    assert len(looks) == 1
+    assert looks.isdisjoint((x.look.colour, x.look.dash) for x in curves if x.name != 'plan')
 
 
 def script() -> ModuleType:

@@ -156,7 +156,9 @@ def response(parts: Sequence[Part]) -> list[Panel]:
         curves += [measured, *pen.samples(
             unit.of(found.time), pen.part.run.stretch, measured)]
     periods = (end - begin) / min(x.run.plant.period for x in parts)
-    curves = [replace(x, look=_dense(x.look, periods)) for x in _once(curves)]
+    # The dots of a plan, which does not ring, are as in the other panels.
+    curves = [x if x.name == 'plan' else replace(x, look=_dense(x.look, periods))
+              for x in _once(curves)]
     return [Panel(time, _position(parts), curves, height=1.45)]
 
 

@@ -60,7 +60,8 @@ TARGET = LineStyle(GREY, 0.9, (2.0, 2.0), order=1)
 #: A target that is held: broad, to be seen on both sides of the curve on it.
 SETPOINT = LineStyle(SILVER, 4.0, order=1, opacity=0.7)
 TOLERANCE = LineStyle(SILVER, order=0, opacity=0.35)
-ARRIVAL = LineStyle(BLACK, 0.8, (1.0, 1.5), order=1)
+#: Solid, since the plan is dotted.
+ARRIVAL = LineStyle(BLACK, 0.6, order=1)
 EQUILIBRIUM = LineStyle(BLACK, marker='o', size=4.5, order=5)
 
 #: Styles of the shapers, by name.
