@@ -6,6 +6,7 @@ import math
 
 from identification_oracle import force_of
 import numpy as np
+from one_sample import sample
 from scipy.constants import mu_0
 from scipy.integrate import solve_ivp
 
@@ -151,7 +152,8 @@ class Bench:
             while self.wire and self.wire[0][0] <= self.now:
                 _, stamp, value = self.wire.pop(0)
                 if self.runtime.looks_at(stamp):
-                    self.runtime.observed('a', stamp, value, math.nan, self.effort())
+                    self.runtime.observed('a', sample(
+                        stamp, value, flux_density=self.effort(), came=self.now))
         return np.array(seen)
 
     def move(self, target, hold):

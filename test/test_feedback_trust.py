@@ -5,6 +5,7 @@ import math
 
 from bench_oracle import Bench, MS, paper, Plant
 import numpy as np
+from one_sample import sample
 import pytest
 
 from hmsa_lab.adapt import adaptive_joint, corrections, estimator, window
@@ -266,7 +267,7 @@ def test_a_request_tries_again_what_saturated_an_amplifier():
 
 def test_one_sample_from_the_future_does_not_count():
     it = bench(False, factors={'shear_modulus': 1.1})
-    it.runtime.observed('a', it.now + 3600 * 10 ** 9, 1.3, math.nan, math.nan)
+    it.runtime.observed('a', sample(it.now + 3600 * 10 ** 9, 1.3, came=it.now))
     left = moves(it, MOVES[:3])
     assert np.max(np.abs(left[1:])) < 0.5
     assert it.estimates[-1].values['ahead_of_clock'] == 1

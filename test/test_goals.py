@@ -4,6 +4,7 @@ from dataclasses import replace
 import math
 
 import numpy as np
+from one_sample import sample
 import pytest
 
 from hmsa.model.actuators import Setup
@@ -78,7 +79,7 @@ class Bench:
                     for joint, true in zip(self.joints, x.stretch.tolist(), strict=True):
                         stamp, stretch = self.spoil(x.time, true)
                         if self.runtime.looks_at(stamp):
-                            self.runtime.observed(joint, stamp, stretch, NAN, NAN)
+                            self.runtime.observed(joint, sample(stamp, stretch, came=self.now))
                         self.goals.observe(joint, stamp, stretch, NAN, self.now)
         self.tick()
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import random
 
 import numpy as np
+from one_sample import sample
 import pytest
 
 from hmsa.interfaces.outcome import newest, Outcome
@@ -122,7 +123,7 @@ class Drawn:
                 self.runtime.applied('a', x.stamp, x.level)
             for stamp, value, _ in read:
                 if self.runtime.looks_at(stamp):
-                    self.runtime.observed('a', stamp, value, math.nan, math.nan)
+                    self.runtime.observed('a', sample(stamp, value, came=self.now))
             changed, read = [], []
         time, logged, stretch = map(np.array, zip(*sorted(samples), strict=True))
         unknown = np.full(len(time), math.nan)

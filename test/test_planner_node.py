@@ -21,10 +21,12 @@ from hmsa.errors import HmsaError
 from hmsa.identification.files import errors_from
 from hmsa.interfaces import topics
 from hmsa.model.parameters import paper_actuator
+from hmsa.model.units import NANOSECONDS
 from hmsa.planning.planner import Options, Planner
 from hmsa.planning.shapers.smooth_limits import SmoothLimits
 from hmsa.planning.timeline import PlannedLevel
 from hmsa_ros.nodes.capture import Taken
+from hmsa_ros.nodes.cdr import SampleReader
 from hmsa_ros.nodes.conversions import from_command, from_time, to_time, to_trajectory
 from hmsa_ros.nodes.planner import PlannerNode
 
@@ -617,14 +619,12 @@ def test_a_sample_that_cannot_be_read_is_ignored(serve, monkeypatch, data):
     node = serve(PlannerNode).nodes[0]
     monkeypatch.setattr(node._runtime, 'looks_at', lambda stamp: True)
     seen = []
-    monkeypatch.setattr(node._runtime, 'observed', lambda *sample, came: seen.append(sample))
-
-    def take(message):
-        node._take_sample(Taken(0, 0, 0, b'', message), 0)
-    take(data)
-    assert not seen
-    take(serialize_message(JointState(name=['actuator'], position=[1.1])))
-    assert [x[0] for x in seen] == ['actuator']
+    monkeypatch.setattr(node._runtime, 'observed', lambda *samples: seen.append(samples))
+    whole = serialize_message(JointState(name=['actuator'], position=[1.1]))
+    node._take_samples([Taken(0, 0, 0, b'', x) for x in (whole, data, whole)], 0)
+    (name, samples), = seen
+    assert name == 'actuator'
+    assert samples.stretch == (1.1, 1.1)
 
 
 def test_samples_that_wait_to_be_read_came_before_and_not_before_they_were_made(
@@ -632,9 +632,9 @@ def test_samples_that_wait_to_be_read_came_before_and_not_before_they_were_made(
     node = serve(PlannerNode, '-p', 'feedback:=observe').nodes[0]
     runtime, seen = node._runtime, []
 
-    def take_long(name, stamp, *values, came):
-        seen.append((stamp, came, node.now()))
-        threading.Event().wait(5e-3)
+    def take_long(name, samples):
+        seen.extend((*x, node.now()) for x in zip(samples.stamps, samples.came, strict=True))
+        threading.Event().wait(5e-3 * len(samples.stamps))
     monkeypatch.setattr(runtime, 'looks_at', lambda stamp: True)
     monkeypatch.setattr(runtime, 'observed', take_long)
     publisher = ros.publisher(topics.JOINT_STATES.type, 'joint_states', topics.SAMPLES)
@@ -708,3 +708,20 @@ def test_backward_jump_of_the_clock_drops_the_plan_and_says_so(bench):
     assert from_command(planner.commands[known])[0] == START + 2 * LEAD
     first = planner.plans[-1].points[0]
     assert (first.positions[0], first.velocities[0]) == (1.0, 0.0)
+
+
+@pytest.mark.parametrize('sizes', [(3, 3, 3), (3, 0, 2), (0, 0, 0)])
+def test_samples_are_read_as_rclpy_reads_them_whatever_their_names(sizes):
+    reader = SampleReader()
+    for number in range(6):
+        names = [f'joint_{k + number // 2}' for k in range(3)]
+        position, velocity, effort = ([0.5 * number + x for x in range(n)] for n in sizes)
+        message = JointState(name=names, position=position, velocity=velocity, effort=effort)
+        message.header.frame_id = 'base' * (number % 2)
+        message.header.stamp.sec, message.header.stamp.nanosec = number, 7
+        joints, stamp, measured = reader.read(serialize_message(message))
+        assert joints == tuple(names)
+        assert stamp == number * NANOSECONDS + 7
+        for field, values in zip((position, velocity, effort), measured, strict=True):
+            assert np.array_equal(
+                values, field + [math.nan] * (3 - len(field)), equal_nan=True)

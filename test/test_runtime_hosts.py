@@ -3,6 +3,7 @@
 from dataclasses import replace
 import math
 
+from one_sample import sample
 import pytest
 from test_runtime_planner import (
     HOLD,
@@ -432,7 +433,7 @@ def test_samples_that_have_waited_to_be_read_do_not_hide_rest():
     rig.runtime.request(StretchRequest('a', 1.05))
     for k in range(125):
         old = asked - 4000 * MS + k * MS
-        rig.runtime.observed('a', old, 1.2, math.nan, rig.plant.flux_density, came=old)
+        rig.runtime.observed('a', sample(old, 1.2, flux_density=rig.plant.flux_density))
         rig.run(rig.now + 2 * MS)
     rig.run(rig.now + 500 * MS)
     assert not any('do not show rest' in x for x in rig.notes())
@@ -480,7 +481,7 @@ def test_a_report_or_a_sample_that_cannot_be_is_ignored(level):
     rig = Rig(settings=replace(QUIET, takeover_timeout=500 * MS))
     rig.runtime.request(StretchRequest('a', 1.2))
     for _ in range(50):
-        rig.runtime.observed('a', rig.now, 1.1, 1.0, level)
+        rig.runtime.observed('a', sample(rig.now, 1.1, 1.0, level))
         rig.steady += 20 * MS
         rig.run(rig.now + 20 * MS)
     rig.runtime.applied('a', rig.now - MS, level)
@@ -567,7 +568,7 @@ def test_samples_of_another_clock_are_refused_and_the_clocks_are_named(lag, text
     rig.now += 2_000_000_000_000 * MS
     assert rig.runtime.request(StretchRequest('a', 1.2)).code == 'waiting'
     for _ in range(300):
-        rig.runtime.observed('a', rig.now - lag * MS, 1.3, 0.0, 0.05)
+        rig.runtime.observed('a', sample(rig.now - lag * MS, 1.3, 0.0, 0.05, came=rig.now))
         rig.steady += 2 * MS
         rig.tick()
     assert rig.status.verdict.code == 'clocks_differ'
@@ -583,7 +584,7 @@ def test_samples_that_are_late_by_a_clock_that_agrees_are_gone_on_from():
     rig.runtime.request(StretchRequest('a', 1.2))
     for _ in range(300):
         rig.runtime.received('a', rig.now - MS, 0, cut_off=False)
-        rig.runtime.observed('a', rig.now - 600 * MS, 1.3, 0.0, 0.05)
+        rig.runtime.observed('a', sample(rig.now - 600 * MS, 1.3, 0.0, 0.05, came=rig.now))
         rig.steady += 2 * MS
         rig.tick()
     assert rig.status.verdict.code == 'accepted'

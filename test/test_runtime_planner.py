@@ -4,6 +4,7 @@ from dataclasses import replace
 import math
 from threading import Semaphore, Thread
 
+from one_sample import sample
 import pytest
 
 from hmsa.errors import HmsaError
@@ -193,8 +194,8 @@ class Rig:
 
     def observe(self, age=0):
         for name, plant in self.plants.items():
-            self.runtime.observed(
-                name, self.now - age, plant.stretch, plant.rate, plant.flux_density)
+            self.runtime.observed(name, sample(
+                self.now - age, plant.stretch, plant.rate, plant.flux_density, came=self.now))
 
     def residual(self, stretch, joint='a'):
         plant, block = self.plants[joint], self.blocks[joint]
@@ -465,8 +466,8 @@ def test_first_request_waits_for_the_state_in_force():
     assert rig.runtime.wants_samples
     rig.runtime.request(StretchRequest('a', 1.25, name='second'))
     rig.observe(age=600 * MS)
-    rig.runtime.observed('knee', rig.now, 1.0, 0.0, 0.0)
-    rig.runtime.observed('a', rig.now, 1.0, math.nan, 0.0)
+    rig.runtime.observed('knee', sample(rig.now, 1.0, 0.0, 0.0))
+    rig.runtime.observed('a', sample(rig.now, 1.0, flux_density=0.0))
     rig.tick()
     assert rig.runtime.wants_samples
     assert rig.codes() == ['none']
@@ -523,7 +524,7 @@ def test_patience_with_a_plant_that_does_not_come_has_an_end():
 def test_impossible_sample_is_ignored_with_a_note():
     rig = Rig(settings=PATIENT)
     rig.runtime.request(StretchRequest('a', 1.1))
-    rig.runtime.observed('a', rig.now, 9.0, 0.0, 0.0)
+    rig.runtime.observed('a', sample(rig.now, 9.0, 0.0, 0.0))
     rig.tick()
     assert rig.status.verdict.code == 'accepted'
     assert 'sample of joint a ignored: stretch in force is 9' in rig.notes()[0]

@@ -4,6 +4,7 @@ from dataclasses import replace
 import math
 
 import numpy as np
+from one_sample import sample
 import pytest
 
 from hmsa.judge import judging, setpoint_samples
@@ -78,7 +79,7 @@ class Loop:
             for stamp, stretch in self.spoil(
                     [(x.time, x.stretch[0]) for x in self.device.samples()]):
                 if self.runtime.looks_at(stamp):
-                    self.runtime.observed('a', stamp, stretch, math.nan, math.nan)
+                    self.runtime.observed('a', sample(stamp, stretch, came=self.now))
         return np.array(truth)
 
     @property
@@ -334,6 +335,45 @@ def test_a_stalled_planner_judges_what_came_meanwhile_and_misses_what_it_did_not
     assert loop.status.verdict.code == 'missed'
 
 
+def _several():
+    """Return a function that runs four joints by 1 ms, their runtime, and their names."""
+    now, names, outputs = START, ('a', 'b', 'c', 'd'), []
+    runtime = Runtime(
+        PlannerGroup({x: Planner(paper_actuator(), Options(
+            flux_density_min=-0.5, flux_density_max=0.5)) for x in names}),
+        Settings(takeover_timeout=0), Environment(
+            clock=lambda: now, steady=lambda: now, observable=lambda: True,
+            unheard=lambda: ''))
+    runtime.active = True
+
+    def run(stretch):
+        nonlocal now
+        outputs.extend((now, x) for x in runtime.tick(now) if isinstance(x, StatusChanged))
+        now += MS
+        if runtime.looks_at(now):
+            for name in names:
+                runtime.observed(name, sample(now, stretch, 0.0))
+    return run, runtime, names, outputs
+
+
+def test_a_status_of_several_joints_is_sparing_and_shows_each_finding():
+    run, runtime, names, statuses = _several()
+    targets = [1.2, 1.1, 1.2, 1.3]
+    runtime.request(Trajectory(
+        names, [((x,) * 4, (k + 1) * HOLD) for k, x in enumerate(targets)], 4, name='x'))
+    for k in range(2400):
+        at = min(max((k - 50) // (HOLD // MS), 0), 3)
+        run(targets[at] if (k - 50) % (HOLD // MS) > 50 else 1.0)
+    shown = {(name, x.setpoint.number, x.verdict)
+             for _, status in statuses for name, x in status.findings.items()}
+    assert {x[:2] for x in shown} == {(name, k + 1) for name in names for k in range(4)}
+    same = [later - before for (before, x), (later, y) in zip(
+        statuses, statuses[1:], strict=False) if x.verdict == y.verdict and x.plan == y.plan]
+    # The first two are those before and after planning.
+    assert min(same[1:]) >= 6 * MS
+    assert len(statuses) < 20
+
+
 def test_judging_several_joints_does_not_keep_commands_waiting(monkeypatch):
     now, cost, judged = START, 0, []
 
@@ -357,7 +397,7 @@ def test_judging_several_joints_does_not_keep_commands_waiting(monkeypatch):
         runtime.tick(now)
         now += MS
         for name in names:
-            runtime.observed(name, now, 1.0 if now < START + 100 * MS else 1.2, 0.0, math.nan)
+            runtime.observed(name, sample(now, 1.0 if now < START + 100 * MS else 1.2, 0.0))
     assert len(judged) >= 4
     assert len(set(judged)) == len(judged)
 
@@ -379,9 +419,9 @@ def test_what_is_held_is_judged_by_later_samples_where_those_after_the_arrival_a
     hold, sensor = setpoint_samples.SetpointSamples(asked), SensorModel()
     for after in range(-99, 1000):
         now = asked.arrival + after * MS
-        if not lost[0] <= after < lost[1] and hold.needs(now, now):
+        if not lost[0] <= after < lost[1]:
             ringing = 0.5 * swing * math.cos(0.6 * after)
-            hold.add(now, 1.2 + (ringing if after > 0 else 0.002 * after), now)
+            hold.add([now], [1.2 + (ringing if after > 0 else 0.002 * after)], now, now)
         hold.judge(now, now, Tolerances(), sensor, observable=True)
     assert hold.over
     assert hold.found.verdict is verdict

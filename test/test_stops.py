@@ -3,6 +3,7 @@
 from dataclasses import replace
 import math
 
+from one_sample import sample
 import pytest
 from test_runtime_hosts import BEATING, Bench
 from test_runtime_planner import HOLD, MS, QUIET, Rig, SEQUENCE, START, trajectory
@@ -241,7 +242,7 @@ def test_samples_that_vibrate_contradict_a_stop(amplitude, code, words):
         noise = 1e-5 * (rig.now // MS % 7)
         stretch = rest + noise + amplitude * math.sin(1e-9 * frequency * rig.now)
         rig.runtime.looks_at(rig.now)
-        rig.runtime.observed('a', rig.now, stretch, 0.0, rig.plant.flux_density)
+        rig.runtime.observed('a', sample(rig.now, stretch, 0.0, rig.plant.flux_density))
     assert outcomes(rig) == ['accepted', code]
     assert rig.status.verdict.message.startswith(words)
 

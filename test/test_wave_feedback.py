@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+from one_sample import sample
 import pytest
 from scipy.integrate import solve_ivp
 from test_path import C1, force, LOAD, TIME, ZETA
@@ -91,9 +92,8 @@ class Run:
             for stamp, level in [x for x in self.sent if self.now - MS < x[0] <= self.now]:
                 self.runtime.applied('a', stamp, level)
             if self.runtime.looks_at(self.now):
-                self.runtime.observed(
-                    'a', self.now, stretch + self.noise * self._random.normal(), math.nan,
-                    math.nan)
+                self.runtime.observed('a', sample(
+                    self.now, stretch + self.noise * self._random.normal()))
         return self
 
     @property

@@ -297,7 +297,7 @@ def _constructor(rig: Rig) -> Seen:
     'driver_planner_killed', 'planner killed', 'while 1.1 is held',
     'off within command_timeout of the last heartbeat, reported')
 def _planner_killed(rig: Rig) -> Seen:
-    with _bench(rig) as bench:
+    with _bench(rig, **{'hardware.timeout': _PATIENT_CALL}) as bench:
         planner = rig.start('planner')
         bench.ready()
         rig.ready('planner')

@@ -110,7 +110,8 @@ PLAN = Topic(
 STATUS = Topic(
     '~/status', 'diagnostic_msgs/msg/DiagnosticStatus', LATCHED,
     'The status of the last request: a code and a sentence, the measured values of the last '
-    'setpoint, and the progress of the sequence.', publishers=(PLANNER,))
+    'setpoint, and the progress of the sequence. With several joints, those that only show '
+    'progress come 2 ms apart for each further joint.', publishers=(PLANNER,))
 OUTCOMES = Topic(
     '~/outcomes', 'diagnostic_msgs/msg/DiagnosticStatus', OUTCOME,
     'The outcome of each requested setpoint, published once the setpoint is evaluated or over, '

@@ -1,5 +1,6 @@
 """Samples of one setpoint, and when they suffice to judge it."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -116,17 +117,41 @@ class SetpointSamples:
 
     # -- samples -------------------------------------------------------------------------------
 
-    def needs(self, stamp: int, steady: int) -> bool:
-        """Return whether a sample is needed; old ones show that newer ones may follow."""
-        if self.over:
-            return False
-        if self._seen < stamp <= self._closes:
-            self._seen, self._heard = stamp, steady
-        return stamp >= self._next_look > self._newest or (
-            stamp not in self._samples and self._counts(stamp))
+    def add(
+            self, stamps: Sequence[int], stretches: Sequence[float], now: int,
+            steady: int) -> None:
+        """
+        Add samples that are read at a time in ns, and at a steady time in ns.
 
-    def add(self, stamp: int, stretch: float, now: int) -> None:
-        """Add a sample that arrives at a time in ns, unless its timestamp is in the future."""
+        Those with a timestamp in the future are left out. Old ones show that newer ones may
+        follow.
+        """
+        if self.over:
+            return
+        closes, looks = self._closes, 2 * self._length
+        if closes < min(stamps) <= max(stamps) <= now + AHEAD:
+            # It only waits to be judged.
+            self._newest = max(self._newest, *stamps)
+            return
+        # Most samples are from the first looks after the arrival, in which all of them count.
+        first, last = max(self.asked, self._begin), self._begin + looks
+        last = min(closes if closes - looks <= last else last, now + AHEAD)
+        if self._cut is not None:
+            last = min(last, self._cut - 1)
+        samples, newest = self._samples, 0
+        for stamp, stretch in zip(stamps, stretches, strict=True):
+            if first <= stamp <= last:
+                samples.setdefault(stamp, stretch)
+                newest = max(newest, stamp)
+            else:
+                self._add(stamp, stretch, now, steady)
+        self._hear(newest, steady)
+        self._newest = max(self._newest, newest)
+
+    def _add(self, stamp: int, stretch: float, now: int, steady: int) -> None:
+        """Add a sample of any time."""
+        if stamp <= self._closes:
+            self._hear(stamp, steady)
         if stamp > now + AHEAD:
             self._ahead = max(self._ahead, stamp - now)
             return
@@ -135,6 +160,10 @@ class SetpointSamples:
             self._samples.setdefault(stamp, stretch)
             if stamp < self.asked:
                 self._moving.add(self._cell(stamp))
+
+    def _hear(self, stamp: int, steady: int) -> None:
+        if stamp > self._seen:
+            self._seen, self._heard = stamp, steady
 
     def _counts(self, stamp: int) -> bool:
         """Return whether a timestamp is in one of the looks."""

@@ -63,7 +63,7 @@ def _judged(run: Run, asked: Outcome, tolerances: Tolerances) -> Finding:
             break
         while sensors and sensors[0].sent <= logged:
             sensor = sensors.pop(0).sensor
-        hold.add(stamp, stretch, stamp)
+        hold.add((stamp,), (stretch,), stamp, logged)
         if stamp >= hold.due:
             hold.judge(stamp, logged, tolerances, sensor, observable=True)
     patience = _END

@@ -16,7 +16,15 @@ from hmsa_lab.adapt.learnt import same_parameters, save
 from hmsa_lab.adapt.messages import differences
 from hmsa_ros.runtime.follower import Follower
 from hmsa_ros.runtime.planning_task import Drafts, PlanningTask
-from hmsa_ros.runtime.records import Clock, EstimateChanged, Output, Settings, Severity, Verdict
+from hmsa_ros.runtime.records import (
+    Clock,
+    EstimateChanged,
+    Output,
+    Samples,
+    Settings,
+    Severity,
+    Verdict,
+)
 
 # Interval in ns at which the estimate is published.
 _REPORT = 200_000_000
@@ -118,15 +126,11 @@ class Feedback(Follower):
             self._settings.feedback_file,
             {name: joint.latest for name, joint in self.joints.items()}, by_joint=by_joint)
 
-    def wants(self, stamp: int) -> bool:
-        """Return whether a sample with a timestamp in ns is needed."""
-        return any(x.wants(stamp) for x in self.joints.values())
-
-    def observed(
-            self, joint: str, stamp: int, stretch: float, flux_density: float, came: int) -> None:
-        """Process a sample of a joint; its timestamp and arrival in ns, its field in T."""
+    def observed(self, joint: str, samples: Samples) -> None:
+        """Process samples of a joint."""
         if joint in self.joints:
-            self.joints[joint].add(stamp, stretch, flux_density, came)
+            for stamp, stretch, _, flux_density, came in zip(*samples, strict=True):
+                self.joints[joint].add(stamp, stretch, flux_density, came)
 
     def applied(self, joint: str, stamp: int, flux_density: float) -> None:
         """Record that a level in T has taken effect, before the plan does."""

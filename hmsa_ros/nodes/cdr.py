@@ -80,6 +80,45 @@ def stamp_of(data: bytes) -> int:
         return 0
 
 
+class SampleReader:
+    """Read serialized JointStates; names are decoded only if they differ from the last ones."""
+
+    def __init__(self) -> None:
+        self._order = self._head = b''  # representation, and the part from frame to names
+        self._names: tuple[str, ...] = ()
+        self._end = 0  # of that part
+
+    def read(self, data: bytes) -> tuple[tuple[str, ...], int, list[Sequence[float]]]:
+        """
+        Return joints, timestamp in ns, and stretch, rate (1/s) and flux density (T) of each.
+
+        A field that is not measured is empty in the message, and NaN here.
+
+        Raises
+        ------
+        BadInputError
+            If it cannot be decoded.
+
+        """
+        reader = CdrReader(data)
+        stamp = reader.time()
+        if data[:2] == self._order and data[_PREAMBLE + 8:self._end] == self._head:
+            reader.place = self._end - _PREAMBLE
+        else:
+            reader.text()
+            many = reader.count()
+            if many > _MOST_JOINTS:
+                raise BadInputError(
+                    f'a sample names {many} joints: expected at most {_MOST_JOINTS}')
+            self._names = tuple(reader.text() for _ in range(many))
+            self._order, self._end = data[:2], reader.place + _PREAMBLE
+            self._head = data[_PREAMBLE + 8:self._end]
+        many = len(self._names)
+        fields = (reader.take('d', reader.count()) for _ in range(3))
+        return self._names, stamp, [
+            x if len(x) == many else (*x, *(math.nan,) * many)[:many] for x in fields]
+
+
 # Minimum size of a point: four lengths and a duration.
 _LEAST_POINT = 24
 # Limit on the number of joints, above that of any planner.

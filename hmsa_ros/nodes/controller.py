@@ -23,7 +23,7 @@ from hmsa_ros.nodes.planner import PlannerNode
 from hmsa_ros.nodes.plant import PlantNode
 from hmsa_ros.nodes.runner import run
 from hmsa_ros.runtime.cycles import Cycles
-from hmsa_ros.runtime.records import ObservedSample, Output, Send
+from hmsa_ros.runtime.records import by_joint, ObservedSample, Output, Send
 from hmsa_ros.timekeeping import steady_ns
 
 # Time in ns that must remain of a period to publish one more message; limit on waiting messages.
@@ -76,10 +76,11 @@ class LinkedPlanner(PlannerNode):
     def take_sample(self, joints: Sequence[str], sample: Sample) -> None:
         """Process a sample of all joints."""
         self._seen = joints, sample
-        if not self._runtime.looks_at(sample.time):
-            return
-        for name, *values in _each(joints, sample):
-            self._runtime.observed(name, sample.time, *values)
+        if self._runtime.looks_at(sample.time):
+            for name, samples in by_joint(joints, [(
+                    sample.time, sample.stretch.tolist(), sample.rate.tolist(),
+                    sample.flux_density.tolist(), self.now())]):
+                self._runtime.observed(name, samples)
 
     def take_refusal(self, joint: str, refuses: str, cut_off_time: int) -> None:
         """Record why commands of a joint are rejected, as in a receipt."""

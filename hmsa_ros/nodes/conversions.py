@@ -1,23 +1,20 @@
 """Conversion between messages and the records of `hmsa.planning`."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import zip_longest
+from collections.abc import Iterable, Mapping, Sequence
 import json
-import math
 from typing import Any, TYPE_CHECKING
 
 from builtin_interfaces.msg import Duration, Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import numpy as np
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import JointState, MagneticField, Temperature, TimeReference
+from sensor_msgs.msg import MagneticField, Temperature, TimeReference
 from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from hmsa.errors import BadInputError
 from hmsa.model.schedule import is_axial_field
 from hmsa.model.units import NANOSECONDS
-from hmsa_ros.nodes.capture import decode
 
 if TYPE_CHECKING:
     # Imported with the planner, which a recorder does not need.
@@ -169,25 +166,6 @@ def to_outcome(outcome: 'Outcome') -> DiagnosticStatus:
     fine = outcome.finding is not None and not outcome.finding.failed
     return to_status(
         'planner: outcome', outcome.joint, int(not fine), outcome.message, outcome.to_texts())
-
-
-def from_samples(data: bytes) -> Iterator[tuple[str, int, tuple[float, float, float]]]:
-    """
-    Yield joint, timestamp in ns, and stretch, rate in 1/s and flux density in T of samples.
-
-    Raises
-    ------
-    BadInputError
-        If the bytes are not a valid JointState.
-
-    """
-    message = decode(data, JointState)
-    stamp = from_time(message.header.stamp)
-    # A field that is not measured is empty.
-    for name, stretch, rate, flux_density in zip_longest(
-            message.name, message.position, message.velocity, message.effort,
-            fillvalue=math.nan):
-        yield str(name), stamp, (stretch, rate, flux_density)
 
 
 def of_joints(key: str, by_joint: Mapping[str, object]) -> dict[str, object]:

@@ -22,7 +22,7 @@ from hmsa.interfaces import topics
 from hmsa.model.units import NANOSECONDS
 from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.capture import RawSubscription, Taken
-from hmsa_ros.nodes.conversions import from_samples
+from hmsa_ros.nodes.cdr import SampleReader
 
 #: Time in s after its last message during which a process counts as running.
 LATELY_SECONDS = 2.5
@@ -74,6 +74,7 @@ class Presence:
         self._samples: RawSubscription | None = None
         # Processes, and publishers of samples of a joint.
         self._processes, self._sampling = Active(), Active()
+        self._reader = SampleReader()
 
     def look(self) -> None:
         """Process the messages that have arrived."""
@@ -88,7 +89,8 @@ class Presence:
             # Only the newest message of each publisher, since reading all would take long.
             for one in {x.publisher: x for x in taken}.values():
                 with suppress(BadInputError):
-                    for joint, _, (stretch, *_) in from_samples(one.data):
+                    joints, _, (stretches, *_) = self._reader.read(one.data)
+                    for joint, stretch in zip(joints, stretches, strict=True):
                         if math.isfinite(stretch):
                             self._sampling.note((joint, one.publisher), one.received_ns)
 

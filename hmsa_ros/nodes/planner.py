@@ -1,6 +1,6 @@
 """Planner node: converts setpoints into a shaped stream of timestamped flux density commands."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -24,7 +24,7 @@ from hmsa.offload import Offload
 from hmsa.plugins import FOLLOWER, registered
 from hmsa_ros.nodes import conversions, ros_entities
 from hmsa_ros.nodes.capture import decode, RawSubscription, Taken
-from hmsa_ros.nodes.cdr import read_trajectory, stamp_of
+from hmsa_ros.nodes.cdr import read_trajectory, SampleReader, stamp_of
 from hmsa_ros.nodes.channel import JointChannel
 from hmsa_ros.nodes.duplicate_nodes import Presence
 from hmsa_ros.nodes.managed import ManagedNode
@@ -54,9 +54,9 @@ _SAMPLES = replace(
 _NEWEST = replace(topics.JOINT_STATES, qos=topics.Quality(20, reliable=False))
 # Time in ns that a subscription to samples is kept after use, since it takes time to match.
 _LINGER_NS = 2 * NANOSECONDS
-# Reading interval in ns, and number of samples read before commands are served again. A callback
-# of the executor takes longer than reading a sample.
-_READ_NS, _AT_ONCE = 10_000_000, 25
+# Reading interval in ns, and number of messages read before commands are served again: of 64
+# joints, they take 2 ms. A callback of the executor takes longer than reading a sample.
+_READ_NS, _AT_ONCE = 10_000_000, 50
 
 
 class PlannerNode(ManagedNode):
@@ -84,6 +84,7 @@ class PlannerNode(ManagedNode):
         self._steps = StepWatch()
         self._runtime = self._new_runtime()
         self._channels: dict[str, JointChannel] = {}
+        self._reader = SampleReader()
         self._samples: RawSubscription | None = None
         self._newest: RawSubscription | None = None
         self._listen_until = self._read = 0
@@ -206,28 +207,31 @@ class PlannerNode(ManagedNode):
         if self._samples is None:
             return False
         before, self._read = self._read, monotonic_ns()
-        samples = self._samples.take(_AT_ONCE)
-        for taken in samples:
-            self._take_sample(taken, before)
-        return len(samples) == _AT_ONCE
+        taken = self._samples.take(_AT_ONCE)
+        # Samples of two plants do not belong to one actuator.
+        if taken and not self._runtime.crowded and self._runtime.looks_at(
+                max(stamp_of(x.data) for x in taken)):
+            self._take_samples(taken, before)
+        return len(taken) == _AT_ONCE
 
-    def _take_sample(self, taken: Taken, after: int) -> None:
-        """Process a sample that arrived after a steady time in ns."""
-        # Most of a thousand samples a second are not needed, and decoding takes time. Samples of
-        # two plants do not belong to one actuator.
-        if self._runtime.crowded or not self._runtime.looks_at(stamp_of(taken.data)):
-            return
-        try:
-            samples = [*conversions.from_samples(taken.data)]
-        except BadInputError as error:
-            self.get_logger().error(f'sample ignored: {error}', throttle_duration_sec=1.0)
-            return
-        # The clock may have been set since the sample arrived. It is read last, so that a pause in
+    def _take_samples(self, taken: Sequence[Taken], after: int) -> None:
+        """Process samples that arrived after a steady time in ns."""
+        ages = [self._ago(x) for x in taken]
+        # The clock may have been set since a sample arrived. It is read last, so that a pause in
         # between cannot make a sample arrive before it was taken.
-        ago = min(self._ago(taken), monotonic_ns() - after)
-        came = self.now() - ago
-        for name, stamp, values in samples:
-            self._runtime.observed(name, stamp, *values, came=came)
+        most = monotonic_ns() - after
+        now = self.now()
+        rows: dict[tuple[str, ...], list[Any]] = {}
+        for message, age in zip(taken, ages, strict=True):
+            try:
+                names, stamp, measured = self._reader.read(message.data)
+            except BadInputError as error:
+                self.get_logger().error(f'sample ignored: {error}', throttle_duration_sec=1.0)
+                continue
+            rows.setdefault(names, []).append((stamp, *measured, now - min(age, most)))
+        for names, of_joints in rows.items():
+            for name, samples in records.by_joint(names, of_joints):
+                self._runtime.observed(name, samples)
 
     def _ago(self, taken: Taken) -> int:
         """Return the age of a received message in ns, by the node's clock."""
@@ -240,12 +244,13 @@ class PlannerNode(ManagedNode):
             if not missing:
                 return
             with suppress(BadInputError):
-                for name, stamp, values in conversions.from_samples(taken.data):
+                names, stamp, measured = self._reader.read(taken.data)
+                for name, stretch, rate, flux_density in zip(names, *measured, strict=True):
                     if name in missing:
                         missing.discard(name)
                         ago = self._ago(taken)
                         yield name, ObservedSample(
-                            stamp, *values,
+                            stamp, stretch, rate, flux_density,
                             None if self._one_clock() else self.now() - ago - stamp,
                             self._runtime.environment.steady() - ago)
 

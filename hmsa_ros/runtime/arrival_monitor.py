@@ -70,6 +70,7 @@ class _Joint:
     corrected: bool = False  # whether the next plan is a correction from samples
     needed: bool = False  # whether the plan was replanned after a deviation
     newest: Finding | None = None
+    unshown: bool = False  # whether that is not in a status yet
     closed: Finding | None = None  # worst finding of the setpoints that are over
     # Begin and arrival of the moves of setpoints that have begun, by number.
     moves: dict[int, list[tuple[int, int | None]]] = field(default_factory=dict)
@@ -300,6 +301,8 @@ class ArrivalMonitor:
         #: Estimates the sensors; feedback may take its place.
         self.follower = follower
         self._publish = publish
+        #: Publishes a status with the newest findings.
+        self.show: Callable[[], None] = lambda: None
         # Goal tolerances of the newest request by joint, and its name; None for a stop.
         self._goals: Mapping[str, GoalTolerances] = {}
         self._label: str | None = ''
@@ -310,8 +313,7 @@ class ArrivalMonitor:
         self._joints: dict[str, _Joint] = {}
         # Requests that another replaced, with setpoints that were reached before.
         self._replaced: list[_Joint] = []
-        # Cached, since reading a clock for each sample of each joint would dominate the time.
-        self._now = 0
+        self._now = 0  # time in ns of the newest judging
         self._heard: int | None = None
         # Begin of the next setpoint in ns: its samples may arrive before the next tick.
         self._opens: int | None = None
@@ -406,6 +408,12 @@ class ArrivalMonitor:
         return {
             name: x.newest for name, x in self._joints.items() if x.newest is not None}
 
+    def shown(self) -> dict[str, Finding]:
+        """Return ``findings``, and record that they are in a status."""
+        for joint in self._joints.values():
+            joint.unshown = False
+        return self.findings
+
     @property
     def worst(self) -> Finding | None:
         """The worst finding of the newest request."""
@@ -461,28 +469,29 @@ class ArrivalMonitor:
 
     # -- samples -------------------------------------------------------------------------------
 
-    def wants(self, stamp: int) -> bool:
-        """Return whether a sample with a timestamp in ns is needed for any joint."""
-        steady, wanted = self._around.steady(), False
-        self._heard = steady
+    def hear(self, stamp: int) -> bool:
+        """Record a sample with a timestamp in ns; return whether samples are needed."""
+        self._heard = self._around.steady()
         if self.adopted:
             self.follow(self._around.clock())
         if self._opens is not None and stamp >= self._opens:
             self._open_until(min(stamp, self._around.clock() + AHEAD))
-        for joint in self._watched:
-            for hold in joint.holds:
-                wanted |= hold.needs(stamp, steady)
-        return wanted
+        return self.open
 
-    def add(self, name: str, stamp: int, stretch: float) -> None:
-        """Add a stretch measured at a timestamp in ns; samples may arrive in any order."""
+    def add(
+            self, name: str, stamps: Sequence[int], stretches: Sequence[float],
+            now: int) -> None:
+        """
+        Add stretches measured at timestamps in ns and read at a time in ns.
+
+        Samples may arrive in any order.
+        """
         if name not in self._joints:
             return
-        if stamp > self._now:
-            self._now = self._around.clock()
+        steady = self._around.steady()
         for joint in (*(x for x in self._replaced if x.key == name), self._joints[name]):
             for hold in joint.holds:
-                hold.add(stamp, stretch, self._now)
+                hold.add(stamps, stretches, now, steady)
 
     def judge(
             self, now: int, tolerances: Tolerances, until: int, *,
@@ -496,10 +505,11 @@ class ArrivalMonitor:
         for joint in self._watched:
             current = joint not in self._replaced
             if joint.news:
-                joint.newest = joint.news.pop(0)
-                self._tell(joint, joint.newest.setpoint, joint.newest)
-                joint.close(joint.newest)
-                return joint.newest
+                miss = joint.news.pop(0)
+                self._renew(joint, miss)
+                self._tell(joint, miss.setpoint, miss)
+                joint.close(miss)
+                return miss
             for hold in joint.holds:
                 if hold.rests(now, observable=observable):
                     continue
@@ -516,11 +526,17 @@ class ArrivalMonitor:
                     # Also before it is over: the planner or a recording may end.
                     self._tell(joint, hold.requested, found)
                 if found is not None and current:
-                    joint.newest = found
+                    self._renew(joint, found)
                     joint.forget(last=1)
                     return found
         self._replaced = [x for x in self._replaced if x.open or x.begins is not None]
         return None
+
+    def _renew(self, joint: _Joint, found: Finding) -> None:
+        """Adopt a finding of a joint, once the one before is in a status."""
+        if joint.unshown:
+            self.show()
+        joint.newest, joint.unshown = found, True
 
     def _tell(
             self, joint: _Joint, setpoint: RequestedSetpoint, found: Finding | None) -> None:

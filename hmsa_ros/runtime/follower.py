@@ -11,7 +11,7 @@ from hmsa.planning.group import PlannerGroup
 from hmsa.planning.timeline import JointModel
 from hmsa.plugins import FOLLOWER, registered
 from hmsa_ros.runtime.planning_task import Drafts, PlanningTask
-from hmsa_ros.runtime.records import Clock, Output, Settings, Verdict
+from hmsa_ros.runtime.records import Clock, Output, Samples, Settings, Verdict
 
 
 class Follower:
@@ -42,13 +42,8 @@ class Follower:
 
     # -- reports -------------------------------------------------------------------------------
 
-    def wants(self, stamp: int) -> bool:
-        """Return whether a sample with a timestamp in ns is needed."""
-        return False
-
-    def observed(
-            self, joint: str, stamp: int, stretch: float, flux_density: float, came: int) -> None:
-        """Process a sample of a joint; its timestamp and arrival in ns, its field in T."""
+    def observed(self, joint: str, samples: Samples) -> None:
+        """Process samples of a joint."""
 
     def applied(self, joint: str, stamp: int, flux_density: float) -> None:
         """Record that a level in T has taken effect, before the plan does."""

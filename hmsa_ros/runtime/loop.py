@@ -11,7 +11,7 @@ from typing import Protocol
 from hmsa.model.equations import Array
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.group import PlannerGroup
-from hmsa_ros.runtime.records import Environment, Output, Send, Settings
+from hmsa_ros.runtime.records import by_joint, Environment, Output, Send, Settings
 from hmsa_ros.runtime.runtime import Runtime
 
 # Time to wait, in ns, while the controller waits for something.
@@ -114,8 +114,9 @@ class Loop:
         for guard in self._guards:
             self.runtime.cut_off(
                 self._names[guard.number], in_force=guard.is_cut_off, time=guard.cut_off_time)
-        for stamp, *measured in self.device.samples():
-            if self.runtime.looks_at(stamp):
-                for name, *values in zip(
-                        self._names, *(x.tolist() for x in measured), strict=True):
-                    self.runtime.observed(name, stamp, *values)
+        samples = self.device.samples()
+        if samples and self.runtime.looks_at(samples[-1][0]):
+            rows = [(stamp, *(x.tolist() for x in measured), self.now)
+                    for stamp, *measured in samples]
+            for name, of_joint in by_joint(self._names, rows):
+                self.runtime.observed(name, of_joint)

@@ -1,6 +1,6 @@
 """What goes into a planner at work, what comes out, and what it asks its caller."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any, NamedTuple, TYPE_CHECKING
@@ -271,6 +271,32 @@ class ObservedSample(NamedTuple):
     flux_density: float  # in T
     lag: int | None = None  # age at arrival in ns; None if all nodes share a clock
     came: int = 0  # time of arrival, in ns by the steady clock; 0 for now
+
+
+class Samples(NamedTuple):
+    """Samples of a joint, in order of arrival."""
+
+    stamps: Sequence[int]  # in ns
+    stretch: Sequence[float]
+    rate: Sequence[float]  # in 1/s; NaN if it is not measured
+    flux_density: Sequence[float]  # in T; NaN if it is not measured
+    came: Sequence[int]  # times of arrival in ns
+
+
+def by_joint(
+        names: Sequence[str],
+        rows: Iterable[tuple[int, Sequence[float], Sequence[float], Sequence[float], int]],
+        ) -> Iterator[tuple[str, Samples]]:
+    """
+    Yield each joint with its samples.
+
+    Each row contains a timestamp, stretch, rate and flux density of all joints, and the time of
+    arrival, in the units of `Samples`.
+    """
+    stamps, *measured, came = zip(*rows, strict=True)
+    for name, stretch, rate, flux_density in zip(
+            names, *(zip(*x, strict=True) for x in measured), strict=True):
+        yield name, Samples(stamps, stretch, rate, flux_density, came)
 
 
 @dataclass

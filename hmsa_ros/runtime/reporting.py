@@ -25,6 +25,9 @@ from hmsa_ros.runtime.records import (
 _PREVIEW, _SOON = 500, 50_000_000
 #: Interval in ns at which subscribers are looked up.
 LOOK = 200_000_000
+# Minimum interval in ns, for each further joint, of a status that only shows progress. A status
+# takes 0.1 ms for each joint: `benchmarks joints`.
+_PER_JOINT = 2_000_000
 # Number of requests whose verdicts are repeated, and time in ns by the steady clock: many requests
 # at once replace each other's status before their senders have read it.
 _ANSWERS, _REPEATED = 64, 30 * NANOSECONDS
@@ -39,6 +42,7 @@ class Reporting:
             *looks: Callable[[], str]) -> None:
         """Begin without a verdict; ``looks`` return the values of `unheard` and `unseen`."""
         self._group, self._deviations, self._watch = group, deviations, watch
+        watch.show = self._publish
         self._around, self._looks = environment, looks
         self.outputs, self.note = outputs, note
         self._look_again = 0
@@ -49,8 +53,12 @@ class Reporting:
         self._answers: dict[str, tuple[Verdict, int, int]] = {}
         self.preview_again: int | None = None  # time in ns of the next part of a long plan
         # What `flush` is to report: verdicts, each with the numbers of accepted requests, late
-        # commands and replannings then, whether a request was adopted, and a preview.
+        # commands and replannings then, whether a request was adopted, and a preview. Progress
+        # waits, since a status contains all joints.
         self._pending: list[tuple[Verdict, int, int, int]] = []
+        self._published: tuple[Verdict, int] | None = None
+        self._pause = _PER_JOINT * (len(group.planners) - 1)
+        self._not_before = 0
         self._looks_due = self._preview_due = False
         self._reported: tuple[Progress, Mapping[str, Progress], bool] | None = None
         # The plans that progress was computed from, valid until `next_change`.
@@ -85,14 +93,24 @@ class Reporting:
 
     def report(self) -> None:
         """Have verdict and progress reported by `flush`."""
-        self._pending.append((
-            self.verdict, self._group.number, self._deviations.lateness.count,
-            self._deviations.replanned))
+        report = (self.verdict, self._group.number, self._deviations.lateness.count,
+                  self._deviations.replanned)
+        if self._pending and self._pending[-1][:2] == report[:2]:
+            self._pending[-1] = report
+        else:
+            self._pending.append(report)
 
     @property
-    def pending(self) -> bool:
-        """Whether there is something for `flush`."""
-        return bool(self._pending or self._preview_due)
+    def pending(self) -> int | None:
+        """Time in ns at which there is something for `flush`; None if there is nothing."""
+        if self._preview_due:
+            return 0
+        if not self._pending:
+            return None
+        # After the clock was set back, nothing waits.
+        waits = len(self._pending) == 1 and self._pending[0][:2] == self._published and (
+            self._not_before - self._around.clock() <= self._pause)
+        return self._not_before if waits else 0
 
     def flush(self) -> None:
         """
@@ -100,8 +118,11 @@ class Reporting:
 
         This is apart from the decisions, which do not wait for it.
         """
-        if not (self._pending or self._preview_due):
-            return
+        due = self.pending
+        if due is not None and due <= self._around.clock():
+            self._publish()
+
+    def _publish(self) -> None:
         if self._looks_due:
             self.look_for_listeners()
         if self._preview_due:
@@ -109,14 +130,17 @@ class Reporting:
         self._looks_due = self._preview_due = False
         if not self._pending:
             return
+        self._published = self._pending[-1][:2]
+        self._not_before = self._around.clock() + self._pause
         self._reported = self._state()
         progress, each, watching = self._reported
         old = self._around.steady() - _REPEATED
         self._answers = {
             name: x for name, x in [*self._answers.items()][-_ANSWERS:] if x[-1] >= old}
+        findings = self._watch.shown()
         for verdict, number, late, replanned in self._pending:
             self.outputs.append(StatusChanged(
-                verdict, progress, each, number, late, replanned, self._watch.findings,
+                verdict, progress, each, number, late, replanned, findings,
                 self._watch.worst, watching, self.unheard, self.unseen, self._watch.measuring,
                 {name: x.model.units.coordinate for name, x in self._group.planners.items()},
                 {name: x[:2] for name, x in self._answers.items()}))
@@ -163,6 +187,10 @@ class Reporting:
 
     def found(self, finding: Finding | None, *, judged: bool = False) -> None:
         """Report a finding; the worst one of the request is the verdict, unless it is judged."""
+        if finding is not None and not finding.failed and not self._watch.finished:
+            # What failed before is the verdict already.
+            self.report()
+            return
         worst = self._watch.worst
         if judged or worst is None or self.verdict.severity is Severity.ERROR or (
                 not worst.failed and (self._warned or not self._watch.finished)):
@@ -173,8 +201,6 @@ class Reporting:
             self.go_on(
                 Verdict(Severity.OK if fine else Severity.WARN, worst.verdict, worst.message),
                 log=worst.failed and worst is finding)
-        # Before the next finding replaces it.
-        self.flush()
 
     def corrected(self, names: Iterable[str], now: int) -> None:
         """Record that plans were corrected at a time in ns, and preview them soon."""

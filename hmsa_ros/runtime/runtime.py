@@ -28,6 +28,7 @@ from hmsa_ros.runtime.records import (
     ObservedSample,
     Output,
     Request,
+    Samples,
     Settings,
     Severity,
     Stop,
@@ -279,24 +280,21 @@ class Runtime:
         else:
             self.deviations.newest[joint] = stamp, flux_density
 
-    def observed(
-            self, joint: str, stamp: int, stretch: float, rate: float,
-            flux_density: float, *, came: int | None = None) -> None:
-        """
-        Process a sample: timestamp in ns, stretch, rate in 1/s and flux density in T.
-
-        If the sample waited to be read, `came` is the time in ns of its arrival.
-        """
-        came = self._clock() if came is None else came - self._stepped
+    def observed(self, joint: str, samples: Samples) -> None:
+        """Process samples of a joint."""
+        now = self._clock()
+        if self._stepped:
+            samples = samples._replace(came=[x - self._stepped for x in samples.came])
         if self._takeover.waiting or not self._takeover.engaged:
-            self._takeover.observe(joint, ObservedSample(
-                stamp, stretch, rate, flux_density,
-                None if self.environment.one_clock() else came - stamp,
-                self._steady() - max(self._clock() - came, 0)))
+            steady, one_clock = self._steady(), self.environment.one_clock()
+            for stamp, stretch, rate, flux_density, came in zip(*samples, strict=True):
+                self._takeover.observe(joint, ObservedSample(
+                    stamp, stretch, rate, flux_density, None if one_clock else came - stamp,
+                    steady - max(now - came, 0)))
         if joint in self.devices.apart:
             return
-        self._watch.add(joint, stamp, stretch)
-        self.follower.observed(joint, stamp, stretch, flux_density, came)
+        self._watch.add(joint, samples.stamps, samples.stretch, now)
+        self.follower.observed(joint, samples)
 
     def temperature(self, joint: str, stamp: int, celsius: float) -> None:
         """Process the temperature of a joint in degrees Celsius, of a time in ns; 0 for now."""
@@ -403,24 +401,23 @@ class Runtime:
             self._watch.open or self.follower.on)
 
     def looks_at(self, stamp: int) -> bool:
-        """Return whether a sample with a timestamp in ns is needed; most are not."""
+        """Record that samples up to a timestamp in ns came; return whether to read them."""
         self.deviations.seen(stamp, sampled=True)
-        return (self._takeover.waiting or self._watch.wants(stamp)
-                or self.follower.wants(stamp))
+        return self._watch.hear(stamp) or self._takeover.waiting or self.follower.on
 
     @property
     def wake(self) -> int | None:
         """Time in ns of the next work; None for never, 0 for now."""
         if (self._set_back or self._stepped or self.planning or self._takeover.waiting
-                or self._outputs or self._reporting.pending
-                or self._listens_until is not None):
+                or self._outputs or self._listens_until is not None):
             return 0
         if not self._takeover.engaged:
-            return None
+            return self._reporting.pending
         now = self._clock()
         times = [
             None if self.devices.all_silent else self.group.next_command(),
-            self._reporting.next_change, self._reporting.preview_again, self._watch.wake(now),
+            self._reporting.pending, self._reporting.next_change, self._reporting.preview_again,
+            self._watch.wake(now),
             self.follower.wake]
         if self.settings.heartbeat_period:
             times.append(self._next_beat)
