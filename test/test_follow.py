@@ -30,8 +30,6 @@ ARRIVED = SUCCEEDED, ErrorCode.SUCCESSFUL
 LEAD = ('-p', 'lead_time:=1.0')
 JOINTS = ('left', 'right')
 OF_JOINTS = ('-p', f'joints:=[{", ".join(JOINTS)}]')
-# Samples, a thousand a second, in more than lead_time, and those that show rest.
-AHEAD, RESTING = 1500, 100
 LONG = ((1.1, 0.0, 0.0), (1.4, 0.0, 5.0))
 
 
@@ -193,10 +191,6 @@ def test_whoever_takes_the_actuator_ends_the_goal(nodes, ros, client):
     assert change(Transition.TRANSITION_DEACTIVATE)
     assert client.ended(handle) == (ABORTED, ErrorCode.INVALID_GOAL)
     assert not client.send((1.2, None, 0.5)).accepted
-    # What was sent ahead applies for lead_time, also to a planner that starts from a sample.
-    samples = ros.collect('sensor_msgs/msg/JointState', '/joint_states')
-    ros.spin_until(lambda: len(samples) > AHEAD and all(
-        abs(x.velocity[0]) < 1e-3 for x in samples[-RESTING:]), 'rest')
     assert change(Transition.TRANSITION_ACTIVATE)
     assert client.ended(client.send((1.2, None, 0.5))) == ARRIVED
 

@@ -672,6 +672,30 @@ def test_activated_again_it_does_not_go_on_from_what_was_seen_before():
     assert rig.residual(1.1) < RESIDUAL
 
 
+@pytest.mark.parametrize('observed', [False, True])
+@pytest.mark.parametrize('after', [0, 1, 10, 30, 60])
+def test_activated_again_it_counts_on_the_levels_that_it_has_sent_ahead(after, observed):
+    rig = Rig(settings=PATIENT if observed else QUIET)
+    rig.observable = observed
+
+    def run(end):
+        while rig.now < end:
+            rig.run(rig.now + MS, step=MS)
+            if observed:
+                rig.observe()
+    rig.observe()
+    assert rig.runtime.request(trajectory(
+        (1.3, HOLD), (1.1, 2 * HOLD), (1.4, 3 * HOLD))).severity is Severity.OK
+    run(START + LEAD + 50 * MS)
+    rig.runtime.deactivate()
+    run(rig.now + after * MS)
+    rig.runtime.active = True
+    rig.runtime.request(StretchRequest('a', 1.2))
+    run(rig.now + 400 * MS)
+    assert rig.residual(1.2) < RESIDUAL
+    assert 'replanned' not in rig.codes()
+
+
 def test_clock_that_is_set_back_drops_the_plan_and_tells_so_once():
     rig = Rig()
     rig.runtime.request(trajectory(*SEQUENCE))

@@ -359,8 +359,6 @@ class Runtime:
         """Come to rest, sending all commands for that now, and accept no more requests."""
         self._process_clock()
         self.active = False
-        # Samples from before the joints come to rest do not show their later position.
-        self._takeover.drop()
         self.planning.clear()
         now = self._clock()
         if self._takeover.engaged and now:
@@ -373,7 +371,15 @@ class Runtime:
             self._reporting.give(Verdict(
                 Severity.OK, Code.INACTIVE, 'deactivated: coming to rest, if its commands arrive'))
         self._stops.drop()
-        self._takeover.engaged = False
+        self._leave(now)
+
+    def _leave(self, now: int) -> None:
+        """Once inactive, forget where the joints are when the last level that was sent applies."""
+        if not self.active and all(
+                x.last_sent.stamp <= now for x in self.group.planners.values()):
+            # Samples from before the joints come to rest do not show their later position.
+            self._takeover.drop()
+            self._takeover.engaged = False
 
     def change(
             self, settings: Settings, models: Mapping[str, JointModel], *,
@@ -419,6 +425,8 @@ class Runtime:
             self._reporting.pending, self._reporting.next_change, self._reporting.preview_again,
             self._watch.wake(now),
             self.follower.wake]
+        if not self.active:
+            times.append(now)
         if self.settings.heartbeat_period:
             times.append(self._next_beat)
         if self.deviations.astray - self.devices.receipts.silent or self.deviations.verdicts:
@@ -472,6 +480,8 @@ class Runtime:
         self._reporting.flush()
         if self._listens():
             return self._taken()
+        if self._takeover.engaged:
+            self._leave(now)
         self._engage()
         estimated = self._send(now) and self.follower.update(now)
         if not estimated and self._may_plan():
