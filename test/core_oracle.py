@@ -11,7 +11,7 @@ from itertools import pairwise
 import math
 
 import numpy as np
-from scipy.integrate import odeint, solve_ivp
+from scipy.integrate import ode, odeint
 from scipy.optimize import brentq
 
 TOLERANCE = 1e-13
@@ -59,19 +59,27 @@ def integrate(
     return states[np.cumsum(apart) - 1]
 
 
+def ended(
+        rates: Callable[..., Sequence[float]], state: Sequence[float], span: float,
+        *arguments: float, rtol: float = TOLERANCE, atol: float = TOLERANCE) -> np.ndarray:
+    """Return the state after a span, by the compiled DOP853: in a third of `solve_ivp`'s time."""
+    # Its own guess of the first step fails where rates underflow.
+    solver = ode(rates).set_integrator(
+        'dop853', rtol=rtol, atol=atol, nsteps=100_000, first_step=0.01 * span)
+    end = solver.set_f_params(*arguments).set_initial_value(state).integrate(span)
+    assert solver.successful(), f'DOP853 ends with {solver.get_return_code()}'
+    return end
+
+
 def follow(
         state: Sequence[float], pieces: Sequence[tuple[float, float]], zeta: float,
-        j_lim: float, c1: float, method: str = 'DOP853',
-        tolerance: float = TOLERANCE) -> tuple[float, float]:
+        j_lim: float, c1: float, tolerance: float = TOLERANCE) -> tuple[float, float]:
     """Return stretch and rate after pieces of (duration, load)."""
-    end = np.array(state, dtype=float)
+    end = state
     for duration, load in pieces:
         if duration > 0.0:
-            solution = solve_ivp(
-                equation(load, zeta, j_lim, c1), (0.0, duration), end, method=method,
-                rtol=tolerance, atol=tolerance)
-            assert solution.success, solution.message
-            end = solution.y[:, -1]
+            end = ended(
+                equation(load, zeta, j_lim, c1), end, duration, rtol=tolerance, atol=tolerance)
     return float(end[0]), float(end[1])
 
 
@@ -95,29 +103,31 @@ def turning_point(
     """
     Return time and stretch of the first turning point of a motion in a direction.
 
-    The event of the dense output is only an estimate, which is refined by integrating to it from
-    the last true step.
+    The steps of the integration enclose it; Newton's method finds it from the last step before.
     """
     right_hand_side = equation(load, zeta, j_lim, c1)
+    steps = []
 
-    def rate(_: float, y: Sequence[float]) -> float:
-        return y[1]
+    def passed(time: float, y: Sequence[float]) -> int:
+        steps.append((time, *y))
+        return -1 if len(steps) > 1 and steps[-2][2] * direction >= 0.0 >= y[1] * direction else 0
 
-    rate.terminal = True
-    rate.direction = -direction
-    solution = solve_ivp(
-        right_hand_side, (0.0, longest), state, method='DOP853', rtol=TOLERANCE,
-        atol=TOLERANCE, events=rate)
-    if solution.status != 1:
+    solver = ode(right_hand_side).set_integrator(
+        'dop853', rtol=TOLERANCE, atol=TOLERANCE, nsteps=100_000, first_step=0.01)
+    solver.set_solout(passed)
+    solver.set_initial_value(state).integrate(longest)
+    assert solver.successful(), f'DOP853 ends with {solver.get_return_code()}'
+    if solver.get_return_code() == 1:
         return None
-    begin, from_state, time = solution.t[-2], solution.y[:, -2], solution.t[-1]
-    for _ in range(4):
-        end = follow(from_state, [(time - begin, load)], zeta, j_lim, c1)
+    (begin, *before), (after, _, rate) = steps[-2:]
+    time = begin + (after - begin) * before[1] / (before[1] - rate)
+    for _ in range(10):
+        end = follow(before, [(time - begin, load)], zeta, j_lim, c1)
         change = -end[1] / right_hand_side(0.0, end)[1]
         time += change
         if abs(change) < 1e-14 * time:
             break
-    return time, follow(from_state, [(time - begin, load)], zeta, j_lim, c1)[0]
+    return time, follow(before, [(time - begin, load)], zeta, j_lim, c1)[0]
 
 
 @cache

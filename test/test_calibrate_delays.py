@@ -32,8 +32,8 @@ def recorded(seed):
     plant = Plant(
         replace(nominal, shear_modulus=random.uniform(0.8, 1.2) * nominal.shear_modulus),
         lag=truth['lag'], ratio=random.uniform(0.0, 0.06) * (seed % 2), tau=0.3)
-    begins = 1.0 + np.cumsum(random.uniform(0.2, 0.35, 24))
-    levels = random.choice([0.0, 0.02, 0.04, -0.02, 0.03], 24) + random.uniform(-3e-3, 3e-3, 24)
+    begins = 1.0 + np.cumsum(random.uniform(0.2, 0.35, 10))
+    levels = random.choice([0.0, 0.02, 0.04, -0.02, 0.03], 10) + random.uniform(-3e-3, 3e-3, 10)
     for begin, level in zip(begins, levels, strict=True):
         plant.levels.append((round((begin + truth['transport']) * 1e9), level))
     time = np.arange(1.0, begins[-1] + 0.3, 1e-3)
