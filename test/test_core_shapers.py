@@ -7,11 +7,11 @@ import math
 import re
 
 from conftest import ROOT
+from core_oracle import ended, equation
 from hypothesis import example, given, HealthCheck, settings
 from hypothesis import strategies as st
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 
 from hmsa import motion
 from hmsa.cli import main
@@ -19,7 +19,6 @@ from hmsa.errors import BadInputError
 from hmsa.model.creep import Creep
 from hmsa.model.delivery import Delivery, ramps
 from hmsa.model.equations import (
-    acceleration,
     critical_zeta,
     elastic_force,
     natural_frequency,
@@ -52,21 +51,19 @@ def end_state(move: Move, request: MoveRequest) -> tuple[float, float, float]:
     pieces, last = ramps(move.levels, request.load, move.duration, request.delivery.slew)
     switches, loads, slopes = np.array(pieces).T
     assert last == pytest.approx(move.levels[-1].load, rel=1e-12)
-    state, largest = [request.state.stretch, request.state.rate], 0.0
+    state, passed = [request.state.stretch, request.state.rate], []
     ends = [*switches[1:], move.duration]
     for begin, end, load, slope in zip(switches, ends, loads, slopes, strict=True):
         if end > begin:
-            def motion(t, y, begin=begin, load=load, slope=slope):
-                force = load + slope * (t - begin)
-                return [y[1], float(acceleration(y[0], y[1], force, request.material))]
-            # LSODA switches to a stiff method where the chains are nearly extended.
-            stretch, rate = solve_ivp(
-                motion, (begin, end), state, method='DOP853', rtol=INTEGRATION,
-                atol=INTEGRATION).y
-            state = [stretch[-1], rate[-1]]
-            largest = max(largest, np.nanmax(
-                stretch * natural_frequency(stretch, request.material)))
-    return float(state[0]), float(state[1]), largest
+            def motion(t, y, load=load, slope=slope, x=request.material):
+                return equation(load + slope * t, x.zeta, x.j_lim, x.c1)(t, y)
+
+            state = ended(
+                motion, state, end - begin, rtol=INTEGRATION, atol=INTEGRATION,
+                seen=lambda _, y: passed.append(y[0]) or 0)
+    stretch = np.array(passed)
+    return float(state[0]), float(state[1]), np.nanmax(
+        stretch * natural_frequency(stretch, request.material), initial=0.0)
 
 
 def distance_from_rest(move: Move, request: MoveRequest) -> float:
