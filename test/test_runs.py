@@ -158,6 +158,17 @@ def test_levels_that_a_board_rounds_took_effect():
     assert lateness_of(commands, applied[:2], BEGIN + 9 * STEP)[1] == 3
 
 
+def test_the_levels_of_a_long_path_are_paired_within_a_second():
+    """Compared one by one, they take minutes, and this test ends at its time limit."""
+    commands = [
+        RecordedLevel(BEGIN + k * STEP, 1e-6 * (7919 * k % 50_021), BEGIN)
+        for k in range(30_000)]
+    applied = [replace(x, stamp=x.stamp + 2000) for x in commands if x.stamp % (5 * STEP)]
+    lateness, unapplied = lateness_of(commands, applied, BEGIN + 10**6 * STEP)
+    assert unapplied == len(commands) - len(applied)
+    assert np.nanmax(np.abs(lateness - 2e-6)) < 1e-12
+
+
 def test_a_late_command_that_the_next_one_replaced_at_once_is_late_and_not_lost():
     commands = [RecordedLevel(BEGIN + i * STEP, 0.01 * (i + 1), BEGIN + 3 * STEP)
                 for i in range(2)]

@@ -1,6 +1,8 @@
 """Levels of the field: commanded, superseded, repeated, and applied."""
 
-from collections.abc import Callable, Iterable, Sequence
+from bisect import bisect_left
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 import math
 
@@ -63,11 +65,10 @@ def came_too_late(
     """
     if applied is None:
         return [x.sent - x.stamp > limit * NANOSECONDS for x in commands]
-    same = _same_for(commands)
+    known = _ByLevel(applied, _rounding(commands))
     return [
-        x.sent - x.stamp > limit * NANOSECONDS - _RECORDED and not any(
-            same(x, y) and x.stamp - ROUNDED_STAMP <= y.stamp <= x.sent + _RECORDED
-            for y in applied)
+        x.sent - x.stamp > limit * NANOSECONDS - _RECORDED
+        and known.first(x, x.stamp - ROUNDED_STAMP, x.sent + _RECORDED + 1) is None
         for x in commands]
 
 
@@ -89,23 +90,25 @@ def lateness_of(
     # Commands that were replaced before their time never took effect.
     standing = in_force((x,) for x in commands)
     places = {x: i for i, x in enumerate(commands)}
-    same = _same_for(commands)
+    rounding = _rounding(commands)
+    taken, changes = _ByLevel(applied, rounding), _ByLevel(standing, rounding)
     # The level when the first command was due; reported levels may be older.
     begin = standing[0].stamp if standing else 0
     before: RecordedLevel | None = max(
         (x for x in applied if x.stamp <= begin), key=lambda x: x.stamp,
         default=min(applied, key=lambda x: x.stamp))
     for i, command in enumerate(standing):
-        until = next(
-            (x.stamp for x in standing[i + 1:] if same(x, command)), math.inf)
-        when = [x.stamp for x in applied if same(x, command)
-                and command.stamp - ROUNDED_STAMP <= x.stamp < until - ROUNDED_STAMP]
+        until = changes.first(command, command.stamp + 1)
+        when = taken.first(
+            command, command.stamp - ROUNDED_STAMP,
+            math.inf if until is None else until - ROUNDED_STAMP)
         following = standing[i + 1] if i + 1 < len(standing) else None
-        if when:
-            result[places[command]] = (min(when) - command.stamp) / NANOSECONDS
-        elif command.stamp < last and not (before and same(before, command)):
-            if following and command.sent > following.stamp and any(
-                    same(x, following) and x.stamp >= following.stamp for x in applied):
+        if when is not None:
+            result[places[command]] = (when - command.stamp) / NANOSECONDS
+        elif command.stamp < last and not (
+                before and abs(before.flux_density - command.flux_density) <= rounding):
+            if following and command.sent > following.stamp and (
+                    taken.first(following, following.stamp) is not None):
                 result[places[command]] = math.inf
             else:
                 unapplied += 1
@@ -113,7 +116,34 @@ def lateness_of(
     return result, unapplied
 
 
-def _same_for(commands: Sequence[RecordedLevel]) -> Callable[[RecordedLevel, RecordedLevel], bool]:
-    """Return a function that tests whether two levels are equal up to rounding by hardware."""
-    rounding = ROUNDED * max((abs(x.flux_density) for x in commands), default=0.0)
-    return lambda one, other: abs(one.flux_density - other.flux_density) <= rounding
+def _rounding(commands: Sequence[RecordedLevel]) -> float:
+    """Return the difference in T by which the hardware may round a level."""
+    return ROUNDED * max((abs(x.flux_density) for x in commands), default=0.0)
+
+
+class _ByLevel:
+    """Levels to be found by level, up to ``rounding`` in T, and time: a path has thousands."""
+
+    def __init__(self, levels: Iterable[RecordedLevel], rounding: float) -> None:
+        self._rounding = rounding
+        self._cells: defaultdict[int, list[tuple[int, float]]] = defaultdict(list)
+        for x in sorted(levels, key=lambda x: x.stamp):
+            if math.isfinite(x.flux_density):
+                self._cells[self._cell(x.flux_density)].append((x.stamp, x.flux_density))
+
+    def _cell(self, level: float) -> int:
+        return math.floor(level / self._rounding) if self._rounding else int(level != 0.0)
+
+    def first(self, like: RecordedLevel, since: int, until: float = math.inf) -> int | None:
+        """Return the first timestamp from ``since`` and before ``until`` of the same level."""
+        cell, found = self._cell(like.flux_density), until
+        for near in (cell - 1, cell, cell + 1):
+            rows = self._cells.get(near, [])
+            for place in range(bisect_left(rows, (since,)), len(rows)):
+                stamp, level = rows[place]
+                if stamp >= found:
+                    break
+                if abs(level - like.flux_density) <= self._rounding:
+                    found = stamp
+                    break
+        return None if found == until else int(found)
