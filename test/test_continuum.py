@@ -95,11 +95,11 @@ def test_shape_or_mount_out_of_range_is_refused(shape, mount, said):
     (((1.4,), (0.1, 0.2), (0.1,)), 'modes.share has 2, .*: expected one of each'),
     (((1.0,), (0.1,), (0.1,)), 'modes.frequency_ratio has 1: expected numbers above 1'),
     (((1.4,), (1.2,), (0.1,)), 'modes.share has 1.2: expected numbers between'),
-    (((1.4, 2.0), (0.6, 0.5), (0.1, 0.1)), 'modes.share has 1.1 in all: expected less than 1'),
+    (((1.4, 2.0), (0.6, 0.5), (0.1, 0.1)), 'modes.share adds up to 1.1: expected less than 1'),
     (((1.4,), (0.1,), (1.0,)), 'modes.damping_ratio has 1: expected'),
     (((1.4,), (0.1,), (0.1,), (9.0,)), 'modes.ratio_exponent has 9: expected numbers from -5'),
     (((1.4,), (0.1,), (0.1,), (), (11.0,)), 'modes.share_exponent has 11: expected numbers'),
-    (((1.4, 2.0), (0.6, -0.5), (0.1, 0.1), (), (1.0, 1.0)), 'sizes of 1.1 in all'),
+    (((1.4, 2.0), (0.6, -0.5), (0.1, 0.1), (), (1.0, 1.0)), 's of modes.share add up to 1.1'),
     (((1.4,), (0.1,), (0.1,), (), (1.0, 2.0)), 'modes.share_exponent has 2 values'),
     (((1.4,) * 4, (0.1,) * 4, (0.1,) * 4), 'has 4 values: expected at most 3'),
     (((math.nan,), (0.1,), (0.1,)), 'modes.frequency_ratio has nan')])

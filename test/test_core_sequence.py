@@ -238,7 +238,7 @@ def test_setpoints_out_of_range_are_refused(stretch, span, reason):
 
 @pytest.mark.parametrize('limits', [(1.0, 1.0), (1.0, -1.0), (math.nan, 1.0), (0.0, math.nan)])
 def test_limits_out_of_order_are_refused(limits):
-    with pytest.raises(BadInputError, match='is not below the largest'):
+    with pytest.raises(BadInputError, match='is not below the maximum'):
         Limits(*limits)
 
 

@@ -248,7 +248,7 @@ def test_a_file_that_exists_is_kept_unless_forced(run, tmp_path):
     (['--remanence', '1e999'], 'remanence is inf T'),
     (['--j-lim', '5 Pa'], "unit 'Pa': expected a number without a unit"),
     (['--zeta', '1', '--damping', '1'], 'both --zeta and --damping'),
-    (['--flux-min', '0.5'], 'expected the least below the largest'),
+    (['--flux-min', '0.5'], 'expected the minimum below the maximum'),
     (['--joint', '1st'], "joint '1st': expected letters"),
     (['--joint', 'a__b'], "joint 'a__b'"),
     (['--joint', 'a,a'], 'named twice'),

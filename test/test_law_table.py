@@ -198,12 +198,12 @@ REFUSED = {
            r'line 2 has flux density -\d+.* T: expected at most 5 T; levels in mT need a column '
            r'flux_density \[mT\]'),
     'mm': (text_of(10.0 * sampled(12)[0], sampled(12)[1]), 'expected 0.1 to 10, the length over'),
-    'unsorted': (LINES[0] + ''.join(LINES[:0:-1]), 'line 3 has stretch .* after 1.6: expected ri'),
-    'duplicate': (GOOD + LINES[-1], 'line 14 has stretch 1.6 again: expected rising stretches'),
+    'unsorted': (LINES[0] + ''.join(LINES[:0:-1]), 'line 3 has stretch .* after 1.6: expected in'),
+    'duplicate': (GOOD + LINES[-1], 'line 14 has stretch 1.6 again: expected increasing'),
     'separators': (GOOD.replace(',', ' ').replace(' ', ',', 1), 'line 2 has .*: expected a number'
                    '|line 2 has flux density nan'),
     'one side': (text_of(*sampled(12, 1.0)), 'has stretches 1 to 1.6: expected some on both si'),
-    'reversed': (text_of(sampled(12)[0], -sampled(12)[1]), 'expected rising ones; a level that'),
+    'reversed': (text_of(sampled(12)[0], -sampled(12)[1]), 'expected increasing ones; a level'),
     'offset': (text_of(sampled(12)[0], sampled(12)[1] + 0.01), 'T at stretch 1: expected 0 with'),
     'falling': (text_of(sampled(40)[0], sampled(40)[1] - 0.1 * np.exp(
         -(20.0 * (sampled(40)[0] - 1.3)) ** 2)), r'does not rise beyond its scatter .* near row '),

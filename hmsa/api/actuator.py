@@ -72,7 +72,7 @@ class Actuator:
     Parameters
     ----------
     shear_modulus : float, optional
-        G in Pa; default 10 kPa. Models with moduli among their constants determine it.
+        G in Pa; default 10 kPa. If the constants of the model include moduli, they determine G.
     density : float
         rho in kg/m^3.
     half_length : float
@@ -102,14 +102,14 @@ class Actuator:
     coil_time_constant : float
         L/R of the coil in s; 0 for none.
     mount : {'paper', 'free', 'glued'}
-        The paper's block, which deforms uniformly in motion, too; or as a continuum with its
-        modes, free or with one face glued to a rigid support (`hmsa.model.continuum`). The shaper
+        The paper's block, which deforms uniformly, also in motion; or a continuum with its modes
+        (`hmsa.model.continuum`), free or with one face glued to a rigid support. The shaper
         ``'modal'`` brings all modes to rest. ``'clamped'`` is for a beam, see `beam`.
     thermal : mapping of str to float, optional
         Temperature coefficients in 1/K of ``shear_modulus``, ``remanence``,
         ``damping_coefficient`` and ``coil_resistance``, and the ``reference`` in degrees Celsius
-        at which all values hold (default 25), as the parameters ``thermal.*``; by default the
-        temperature changes nothing.
+        at which all values hold (default 25), as the parameters ``thermal.*``; default no effect
+        of the temperature.
 
     Raises
     ------
@@ -492,7 +492,7 @@ class Actuator:
         Warns
         -----
         UnusualWarning
-            If the magnets may lose remanence for good.
+            If the magnets may lose remanence permanently.
 
         Examples
         --------

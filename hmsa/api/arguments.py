@@ -365,10 +365,10 @@ def limits_of(limits: Any) -> tuple[float, float]:
     given = [number(x, 'a flux density limit', 'T') for x in several(limits)]
     if len(given) not in (1, 2):
         raise BadInputError(
-            f'limits are {excerpt(limits)}: expected the least and the largest flux density '
+            f'limits are {excerpt(limits)}: expected minimum and maximum flux density '
             'in T, or one number for both directions')
     low, high = given if len(given) == 2 else (-given[0], given[0])
     if not low < high:
         raise BadInputError(
-            f'flux densities from {low:g} to {high:g} T: expected the least below the largest')
+            f'flux densities from {low:g} to {high:g} T: expected the minimum below the maximum')
     return low, high

@@ -74,11 +74,11 @@ class Modes:
                     raise BadInputError(f'modes.{name} has {value:g}: expected {expected}')
         if any(self.share_exponents) and not sum(map(abs, self.shares)) < 1.0:
             raise BadInputError(
-                f'modes.share has sizes of {sum(map(abs, self.shares)):g} in all: expected less '
-                'than 1 with modes.share_exponent')
+                f'magnitudes of modes.share add up to {sum(map(abs, self.shares)):g}: expected '
+                'less than 1 with modes.share_exponent')
         if not self.first > 0.0:
             raise BadInputError(
-                f'modes.share has {sum(self.shares):g} in all: expected less than 1, as the first '
+                f'modes.share adds up to {sum(self.shares):g}: expected less than 1, as the first '
                 'mode has the rest')
 
     @property

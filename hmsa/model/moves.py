@@ -93,7 +93,7 @@ class Limits:
         """Check the order."""
         if not self.minimum < self.maximum:
             raise BadInputError(
-                f'the least flux density {self.minimum:g} is not below the largest '
+                f'the minimum flux density {self.minimum:g} is not below the maximum '
                 f'{self.maximum:g}')
 
     def check(self, load: float, target: float, units: Units) -> None:

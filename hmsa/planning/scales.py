@@ -59,7 +59,7 @@ def scales(actuator: ActuatorParameters, least: float, most: float) -> Scales:
     """
     if not -math.inf < least < most < math.inf:
         raise BadInputError(
-            f'flux densities from {least:g} to {most:g} T: expected the least below the largest')
+            f'flux densities from {least:g} to {most:g} T: expected the minimum below the maximum')
     material = actuator.nondimensional
     home = material.rest
     units = actuator.units

@@ -111,7 +111,7 @@ def _check(
         if not stretch[i] > stretch[i - 1]:
             how = 'again' if stretch[i] == stretch[i - 1] else f'after {stretch[i - 1]:g}'
             raise BadInputError(
-                f'{source} {places[i]} has stretch {stretch[i]:g} {how}: expected rising '
+                f'{source} {places[i]} has stretch {stretch[i]:g} {how}: expected increasing '
                 'stretches, each once; take the mean of repeated measurements')
     if not stretch[0] < 1.0 < stretch[-1]:
         raise BadInputError(
@@ -119,8 +119,8 @@ def _check(
             'sides of 1, since a block swings there on its way to rest')
     if not flux[-1] > flux[0]:
         raise BadInputError(
-            f'{source} has flux densities from {flux[0]:g} T at the least stretch to '
-            f'{flux[-1]:g} T at the largest: expected rising ones; a level that stretches the '
+            f'{source} has flux densities from {flux[0]:g} T at the smallest stretch to '
+            f'{flux[-1]:g} T at the largest: expected increasing ones; a level that stretches the '
             'block is positive')
 
 
