@@ -83,7 +83,8 @@ def run(arguments: argparse.Namespace) -> int:
     # Each repeat has its own folder.
     folders = [folder] if arguments.repeat == 1 else [
         folder / str(i + 1) for i in range(arguments.repeat)]
-    experiments = [_experiment(arguments, x) for x in folders]
+    with progress('reading the sequence', lines=PATIENCE):
+        experiments = [_experiment(arguments, x) for x in folders]
     for x in folders:
         prepare(x)
     ENDING.note()
