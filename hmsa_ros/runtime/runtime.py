@@ -483,7 +483,10 @@ class Runtime:
         if self._takeover.engaged:
             self._leave(now)
         self._engage()
-        estimated = self._send(now) and self.follower.update(now)
+        estimated = False
+        if self._send(now):
+            self._beat(now)
+            estimated = self.follower.update(now)
         if not estimated and self._may_plan():
             self.planning.work_on()
         if self._reporting.preview_again is not None and now >= self._reporting.preview_again:
@@ -516,14 +519,16 @@ class Runtime:
         self.devices.send(now)
         if self.deviations.lateness.count > late:
             self.follower.give_way(now)
+        return True
+
+    def _beat(self, now: int) -> None:
+        """Send heartbeats if they are due, and look which devices report."""
         if self.settings.heartbeat_period and now >= self._next_beat:
-            # Heartbeats, and a check which devices report.
             self._next_beat = now + self.settings.heartbeat_period
             if self.settings.replan_late:
                 self.deviations.look_for_unheard(now)
             self._drop(self.devices.look_for_newcomers())
             self.devices.beat(now, finds_lost=self.settings.replan_late)
-        return True
 
     def _taken(self) -> list[Output]:
         outputs = self._outputs.copy()
