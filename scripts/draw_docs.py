@@ -55,8 +55,7 @@ from hmsa.report.picture import draw  # noqa: E402
 from hmsa.runs.levels import RecordedLevel  # noqa: E402
 from hmsa.runs.record import Run  # noqa: E402
 from hmsa.runs.setpoints import described  # noqa: E402
-from hmsa_ros.clients.adapting import second_act  # noqa: E402
-from hmsa_ros.clients.demo import SEQUENCE  # noqa: E402
+from hmsa_ros.clients.demo import second_act, SEQUENCE  # noqa: E402
 from hmsa_studies.__main__ import PICTURES as STUDIES  # noqa: E402
 from hmsa_studies.paper import draw_figure, FIGURES  # noqa: E402
 from hmsa_studies.warming import SILICONE  # noqa: E402

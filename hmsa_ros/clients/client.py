@@ -20,13 +20,13 @@ from hmsa.interfaces import topics
 from hmsa.interfaces.status import StatusVerdict
 from hmsa.model.status import Code
 from hmsa.model.units import NANOSECONDS
-from hmsa_ros.clients import graph
 from hmsa_ros.clients.experiment import check_stretches
 from hmsa_ros.clients.link import Link, SILENCE
 from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.capture import decode, RawSubscription
 from hmsa_ros.nodes.conversions import from_time, to_trajectory
 from hmsa_ros.nodes.duplicate_nodes import LATELY_SECONDS, Presence
+from hmsa_ros.nodes.ros_entities import publishers_of, recorders, subscribers_of
 from hmsa_ros.nodes.service_call import ServiceCall
 from hmsa_ros.nodes.temporary_node import SLICE_SECONDS
 
@@ -195,7 +195,7 @@ class PlannerClient(Link):
 
     def unheard(self) -> list[str]:
         """Return the command topics without subscribers other than recorders."""
-        return graph.unheard(self.node, self._namespace, self._joints)
+        return unheard(self.node, self._namespace, self._joints)
 
     def send(
             self, setpoints: Sequence[tuple[float | Sequence[float], float]],
@@ -398,3 +398,22 @@ def _slower_time(node: Node, timeout: float) -> Iterator[Callable[[], float]]:
         yield time
     finally:
         clock.destroy()
+
+
+def unheard(node: Node, namespace: str, joints: Sequence[str]) -> list[str]:
+    """Return a planner's command topics without subscribers other than recorders."""
+    leave_out = recorders(node)
+    return [x for x in _commands(node, namespace, joints)
+            if leave_out.issuperset(subscribers_of(node, x).values())]
+
+
+def _commands(node: Node, namespace: str, joints: Sequence[str]) -> list[str]:
+    """Return the topics on which the planner commands joints, including remapped ones."""
+    planner = f'/{namespace.strip("/")}/{topics.PLANNER}'.replace('//', '/')
+    named = [
+        topic for topic, types in node.get_topic_names_and_types()
+        if topics.FLUX_DENSITY_COMMAND.type in types
+        and planner in publishers_of(node, topic).values()]
+    return [x for x in named if x.split('/')[-2] in joints] or named or [
+        node.resolve_topic_name(
+            topics.of_joint(topics.FLUX_DENSITY_COMMAND, x, joints).name) for x in joints]
