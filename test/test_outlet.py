@@ -8,7 +8,7 @@ from rclpy.exceptions import InvalidHandle
 from rclpy.serialization import serialize_message
 from std_msgs.msg import Float64, UInt8MultiArray
 
-from hmsa_ros.nodes.fast_publisher import Outlet
+from hmsa_ros.nodes.capture import Outlet
 
 _LARGE = 30_000_000
 _TIMES = 50

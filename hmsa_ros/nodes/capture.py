@@ -1,5 +1,5 @@
 """
-Take raw messages from subscriptions, fast and with their metadata.
+Take raw messages from subscriptions, fast and with their metadata, and publish without the lock.
 
 The executors of rclpy pass one message at a time, without its publisher. Here a separate thread
 polls several subscriptions and takes all messages that have arrived at once, with the publisher's
@@ -18,8 +18,9 @@ from typing import Any, NamedTuple
 from rclpy.exceptions import InvalidHandle
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
-from rclpy.serialization import deserialize_message
+from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.type_support import check_is_valid_msg_type
 
 from hmsa.errors import BadInputError
@@ -297,3 +298,40 @@ class SimulatedTime:
     def at(self, received_ns: int) -> int:
         """Return the simulated time at a system time, in ns; the first one for earlier times."""
         return self._times[max(0, bisect_right(self._received, received_ns) - 1)]
+
+
+@cache
+def _function() -> Any:
+    """Return rcl's function; calls through `ctypes.CDLL` release the global interpreter lock."""
+    found = ctypes.CDLL('librcl.so').rcl_publish_serialized_message
+    found.argtypes = [ctypes.c_void_p] * 3
+    found.restype = ctypes.c_int
+    return found
+
+
+class Outlet:
+    """
+    Publish from one thread with a publisher of rclpy, while other threads run.
+
+    rclpy holds the global interpreter lock while the middleware sends. A send that blocks, for
+    example to a host that has disappeared, would block all threads, including the one that serves
+    a coil.
+    """
+
+    def __init__(self, publisher: Publisher) -> None:
+        self._publisher = publisher
+        self._send = _function()
+        self._buffer = Buffer()
+        self._address = ctypes.byref(self._buffer)
+
+    def publish(self, message: Any) -> None:
+        """Publish a message, or bytes of a serialized one."""
+        data = message if isinstance(message, bytes) else serialize_message(message)
+        self._buffer.buffer = ctypes.cast(ctypes.c_char_p(data), ctypes.c_void_p).value
+        self._buffer.length = self._buffer.capacity = len(data)
+        handle = self._publisher.handle
+        with handle:
+            failed = self._send(handle.pointer, self._address, None)
+        if failed:
+            # rclpy raises an error with the reason.
+            self._publisher.publish(data)

@@ -21,9 +21,8 @@ from hmsa_ros.device.protocol import Change, Kind, Notice, Sample
 from hmsa_ros.device.watchdog import Fallback, SAFE_FLUX
 from hmsa_ros.device.worker import STALL
 from hmsa_ros.nodes import conversions, ros_entities
-from hmsa_ros.nodes.capture import decode, RawSubscription
+from hmsa_ros.nodes.capture import decode, Outlet, RawSubscription
 from hmsa_ros.nodes.duplicate_nodes import Presence
-from hmsa_ros.nodes.fast_publisher import Outlet
 from hmsa_ros.nodes.managed import ManagedNode, silence
 from hmsa_ros.nodes.parameters import JointParameters, JOINTS
 from hmsa_ros.runtime.throttle import Throttle

@@ -25,8 +25,8 @@ from hmsa.interfaces import topics
 from hmsa.interfaces.parameters import ParameterSpec
 from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.address import AddressWatch
+from hmsa_ros.nodes.capture import Outlet
 from hmsa_ros.nodes.conversions import to_diagnostics, to_status
-from hmsa_ros.nodes.fast_publisher import Outlet
 from hmsa_ros.nodes.parameters import (
     check_former_names,
     check_names,
