@@ -24,7 +24,7 @@ from hmsa.bag.writer import BagTopic, BagWriter
 from hmsa.cli import main
 from hmsa.interfaces import topics
 from hmsa_ros.clients.launching import REPLAY
-from hmsa_ros.recording.playback_clock import PlaybackClock
+from hmsa_ros.recording.playback import PlaybackClock
 
 pytestmark = pytest.mark.ros
 FLOAT = 'std_msgs/msg/Float64'

@@ -32,12 +32,23 @@ from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.conversions import to_clock, to_status
 from hmsa_ros.nodes.managed import ManagedNode
 from hmsa_ros.nodes.parameters import declare
-from hmsa_ros.nodes.playback_publishers import create_senders, full_name, latched, NAMED_AT_MOST
-from hmsa_ros.nodes.required_subscribers import Audience, Followers
+from hmsa_ros.nodes.playback_publishers import (
+    Audience,
+    create_senders,
+    Followers,
+    full_name,
+    latched,
+    NAMED_AT_MOST,
+)
 from hmsa_ros.nodes.runner import run
 from hmsa_ros.nodes.selection import Filter
-from hmsa_ros.recording.playback_clock import PlaybackClock
-from hmsa_ros.recording.sender import CLOCK_WHILE_WAITING_SECONDS, ClockOut, Excerpt, Sender
+from hmsa_ros.recording.playback import (
+    CLOCK_WHILE_WAITING_SECONDS,
+    ClockOut,
+    Excerpt,
+    PlaybackClock,
+    Sender,
+)
 
 _POLL_SECONDS = 0.02
 # Reliable messages that found the receiver's queue full are sent again when a heartbeat of Fast
