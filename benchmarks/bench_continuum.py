@@ -35,10 +35,9 @@ from hmsa.model.modes import Modes
 from hmsa.model.moves import Limits, Move, State
 from hmsa.model.parameters import ActuatorParameters
 from hmsa.model.simulation import ActuatorSimulation
-from hmsa.planning.remaining import remaining
+from hmsa.planning.sequence import remaining
 from hmsa.planning.shapers import get_shaper
-from hmsa.planning.shapers.request import MoveRequest
-from hmsa.planning.shapers.smooth_limits import SmoothLimits
+from hmsa.planning.shapers.request import MoveRequest, SmoothLimits
 
 #: H/L, and elements along x, y and z.
 SHAPES = {0.1: (6, 6, 2), 0.3: (6, 6, 3), 0.5: (5, 5, 4), 0.707: (5, 5, 4), 1.0: (5, 5, 5),

@@ -16,8 +16,7 @@ from hmsa.model.moves import State
 from hmsa.model.parameters import NondimensionalParameters
 from hmsa.model.residual import percent
 from hmsa.planning.shapers import SHAPERS
-from hmsa.planning.shapers.request import MoveRequest
-from hmsa.planning.shapers.smooth_limits import SmoothLimits
+from hmsa.planning.shapers.request import MoveRequest, SmoothLimits
 from hmsa.report.paper import SCREEN
 from hmsa_studies.damped import damped_study, DampedStudy, LIMITS
 from hmsa_studies.pictures import draw_damped, draw_front, draw_robustness, draw_sampled

@@ -24,8 +24,7 @@ from hmsa.model.parameters import NondimensionalParameters, paper_actuator
 from hmsa.model.simulation import follow, observed, sampled
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Options, Planner
-from hmsa.planning.remaining import remaining
-from hmsa.planning.sequence import plan_sequence
+from hmsa.planning.sequence import plan_sequence, remaining
 from hmsa.planning.shapers import get_shaper
 from hmsa.planning.shapers.request import MoveRequest
 

@@ -23,7 +23,7 @@ from hmsa.interfaces import topics
 from hmsa.model.parameters import paper_actuator
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.planner import Options, Planner
-from hmsa.planning.shapers.smooth_limits import SmoothLimits
+from hmsa.planning.shapers.request import SmoothLimits
 from hmsa.planning.timeline import PlannedLevel
 from hmsa_ros.nodes.capture import Taken
 from hmsa_ros.nodes.cdr import SampleReader

@@ -19,8 +19,7 @@ from hmsa.model.status import Code, RefusedError
 from hmsa.planning.planner import Options, Planner
 from hmsa.planning.sequence import plan_sequence
 from hmsa.planning.shapers import get_shaper
-from hmsa.planning.shapers.request import MoveRequest
-from hmsa.planning.shapers.smooth_limits import SmoothLimits
+from hmsa.planning.shapers.request import MoveRequest, SmoothLimits
 
 MS = 1_000_000
 ZETA, C1 = 0.2, 2.0

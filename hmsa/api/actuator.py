@@ -47,8 +47,7 @@ from hmsa.model.moves import Setpoint, State
 from hmsa.model.parameters import ActuatorParameters
 from hmsa.planning.scales import Scales, scales
 from hmsa.planning.sequence import plan_sequence
-from hmsa.planning.shapers.request import as_errors, ERRORS, MoveRequest
-from hmsa.planning.shapers.smooth_limits import SmoothLimits
+from hmsa.planning.shapers.request import as_errors, ERRORS, MoveRequest, SmoothLimits
 from hmsa.planning.timeline import JointModel
 from hmsa.runs.parameters import read_parameter_file, values_of
 from hmsa.table import Column, Table

@@ -171,8 +171,7 @@ def _without_dimension(arguments: argparse.Namespace) -> int:
     from hmsa.model.status import Code, RefusedError
     from hmsa.model.units import Units
     from hmsa.planning.sequence import plan_sequence
-    from hmsa.planning.shapers.request import as_errors, ERRORS, MoveRequest
-    from hmsa.planning.shapers.smooth_limits import SmoothLimits
+    from hmsa.planning.shapers.request import as_errors, ERRORS, MoveRequest, SmoothLimits
 
     if arguments.temperature is not None:
         raise BadInputError(

@@ -26,11 +26,9 @@ from hmsa.model.simulation import follow, longest_motion, observed, sampled
 from hmsa.model.status import Code
 from hmsa.model.units import NANOSECONDS, Units
 from hmsa.planning.path import Path
-from hmsa.planning.remaining import Remaining
-from hmsa.planning.sequence import check_short_spell
+from hmsa.planning.sequence import check_short_spell, Remaining
 from hmsa.planning.shapers import creeping, get_shaper
-from hmsa.planning.shapers.request import as_errors, ERRORS
-from hmsa.planning.shapers.smooth_limits import PACE, SmoothLimits
+from hmsa.planning.shapers.request import as_errors, ERRORS, PACE, SmoothLimits
 
 #: Options that describe coil and block, and can be estimated.
 ESTIMATED = ('coil_time_constant', 'constant_force')

@@ -19,8 +19,14 @@ from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Options, Planner
 from hmsa.planning.sequence import SHORT_SPELL
 from hmsa.planning.shapers import SHAPERS
-from hmsa.planning.shapers.request import ERRORS, LARGEST_ERROR, MOST_ORDER
-from hmsa.planning.shapers.smooth_limits import LEAST_PERIODS, MOST_PERIODS, SmoothLimits
+from hmsa.planning.shapers.request import (
+    ERRORS,
+    LARGEST_ERROR,
+    LEAST_PERIODS,
+    MOST_ORDER,
+    MOST_PERIODS,
+    SmoothLimits,
+)
 from hmsa.planning.timeline import JointModel
 from hmsa_ros.nodes.managed import AUTOSTART
 from hmsa_ros.nodes.markers import MARKER_SCALE

@@ -9,7 +9,7 @@ A shaper takes a `MoveRequest` and returns a `Move`, whose first level is at tim
 import math
 
 from hmsa.errors import BadInputError, meant
-from hmsa.planning.shapers.linear import ei, step, zv, zvd
+from hmsa.planning.shapers.linear import ei, step, umzv, zv, zvd
 from hmsa.planning.shapers.minimax import minimax
 from hmsa.planning.shapers.minimum_time import minimum_time
 from hmsa.planning.shapers.modal import modal
@@ -17,7 +17,6 @@ from hmsa.planning.shapers.request import advised, Shaper
 from hmsa.planning.shapers.robust import robust
 from hmsa.planning.shapers.smooth import smooth
 from hmsa.planning.shapers.two_step import two_step
-from hmsa.planning.shapers.umzv import umzv
 
 #: Shapers by name.
 SHAPERS: dict[str, Shaper] = {

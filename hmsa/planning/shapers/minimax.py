@@ -28,7 +28,7 @@ from hmsa.model.moves import Level, Move, State
 from hmsa.model.simulation import branches_of, flow_rates, with_followed
 from hmsa.model.status import Code
 from hmsa.planning.shapers.creeping import arrival
-from hmsa.planning.shapers.oscillation import oscillation
+from hmsa.planning.shapers.linear import oscillation
 from hmsa.planning.shapers.request import as_errors, AT_REST, LARGEST_ERROR, MoveRequest
 from hmsa.planning.shapers.robust import robust
 

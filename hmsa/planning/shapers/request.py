@@ -19,8 +19,9 @@ from hmsa.model.parameters import NondimensionalParameters
 from hmsa.model.simulation import branches_of
 from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import Units
-from hmsa.planning.shapers.smooth_limits import PACE, SmoothLimits
 
+#: Range of the minimum duration of a move, in natural periods.
+LEAST_PERIODS, MOST_PERIODS = 0.2, 50.0
 #: Default relative errors of G, damping coefficient and J_lim.
 ERRORS = (0.1, 0.1, 0.1)
 #: Maximum relative error.
@@ -38,6 +39,28 @@ _CODES = {'flux': Code.FLUX_LIMIT, 'slew': Code.SLEW_LIMIT, 'period': Code.NO_TW
 _ADVISING = 400_000
 # Factors by which limits are relaxed.
 _FACTORS = (1.5, 3.0, 10.0, 30.0, math.inf)
+
+
+@dataclass(frozen=True)
+class SmoothLimits:
+    """Minimum duration and maximum rate of the shaper smooth."""
+
+    #: Minimum duration of a move, in natural periods about the target, 0.2 to 50.
+    periods: float = 1.0
+    rate: float = math.inf  #: maximum stretch rate, above 0; infinite for no limit
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        if not LEAST_PERIODS <= self.periods <= MOST_PERIODS:
+            raise BadInputError(
+                f'smooth_periods is {self.periods:g}: expected {LEAST_PERIODS:g} to '
+                f'{MOST_PERIODS:g} natural periods')
+        if not self.rate > 0.0:
+            raise BadInputError(f'stretch_rate_max is {self.rate:g}: expected a number above 0')
+
+
+#: One natural period, at any rate.
+PACE = SmoothLimits()
 
 
 def as_errors(values: Sequence[float] | Ellipsoid) -> Uncertainty:

@@ -23,8 +23,7 @@ from hmsa.model.simulation import branches_of, sampled
 from hmsa.model.status import Code, RefusedError
 from hmsa.planning.inverse_dynamics import fade, held_along, loads_for
 from hmsa.planning.shapers.free import at_rest
-from hmsa.planning.shapers.request import MoveRequest
-from hmsa.planning.shapers.smooth_limits import MOST_PERIODS
+from hmsa.planning.shapers.request import MOST_PERIODS, MoveRequest
 from hmsa.planning.shooting import Attempt, solve, Template, within_limits
 
 # Points of a path, levels per natural period, and minimum and maximum number of levels.
