@@ -20,7 +20,7 @@ from benchmarks.reference import Actuator, two_step
 from benchmarks.sheet import Sheet
 from hmsa.interfaces import topics
 from hmsa.interfaces.actuator import parameters_of
-from hmsa_studies.scenario import Scenario, SCENARIOS
+from hmsa_studies.commanders import Scenario, SCENARIOS
 
 #: Stretches of a first move from 1, and of the next one.
 TARGETS = (1.4, 1.1)

@@ -18,10 +18,19 @@ from hmsa.planning.shapers.request import MoveRequest
 from hmsa.report import looks, style
 from hmsa.report.looks import LineStyle
 from hmsa.report.paper import Paper
-from hmsa_studies.damped import DampedStudy, LIMITS, limits_of, SETTLED
+from hmsa_studies.moves import (
+    DampedStudy,
+    ideal_move,
+    LIMITS,
+    limits_of,
+    PROMISED,
+    rounded_move,
+    SampledStudy,
+    SETTLED,
+    solved_move,
+)
 from hmsa_studies.residual import Actual
 from hmsa_studies.robustness import Candidate, Case, ORDERED, Result
-from hmsa_studies.sampled import ideal_move, PROMISED, rounded_move, SampledStudy, solved_move
 
 # Smaller residuals are drawn at this value.
 _FLOOR = 1e-4

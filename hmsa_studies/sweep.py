@@ -21,11 +21,10 @@ from hmsa.interfaces.parameters import LAW_NAME, present_name
 from hmsa.model.equations import Array, signed_root
 from hmsa.model.laws import LAWS
 from hmsa.planning.shapers import get_shaper
-from hmsa_studies.axes import parse_grid
+from hmsa_studies.axes import parse_grid, SweepAxis, View
 from hmsa_studies.plans import by_batch, by_settings, carried_out, Plans, STATUS
 from hmsa_studies.settings import FINITE, Nondimensional, Range, Setting, System
 from hmsa_studies.study_folder import LEAST_ROWS, MOST_ROWS
-from hmsa_studies.views import Axis, View
 
 __all__ = ['parse_grid', 'ROW_BYTES', 'Rows', 'Sweep']
 
@@ -169,7 +168,7 @@ class Sweep:
     def view(self) -> View:
         """Return how to draw the sweep; raise `BadInputError` if there is no figure of it."""
         return View.of([
-            Axis.of(axis, samples=i == self._sampled) for i, axis in enumerate(self._axes)
+            SweepAxis.of(axis, samples=i == self._sampled) for i, axis in enumerate(self._axes)
             if self._shape[i] > 1])
 
     @property

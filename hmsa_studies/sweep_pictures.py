@@ -17,8 +17,8 @@ from hmsa.interfaces.parameters import PLANNED
 from hmsa.model.equations import Array
 from hmsa.report import looks, style
 from hmsa.report.paper import Paper
+from hmsa_studies.axes import SweepAxis, View
 from hmsa_studies.settings import ACTUAL, BLOCK_OF, Nondimensional
-from hmsa_studies.views import Axis, View
 
 #: Quantiles of the samples that limit the bands, and the quantile that maps show.
 BANDS, MAPPED = ((0.05, 0.95), (0.25, 0.75)), 0.95
@@ -127,7 +127,7 @@ def _wide(values: Array) -> bool:
     return bool(known.size and known.min() > 0.0 and known.max() > _DECADES * known.min())
 
 
-def _even(axis: Axis) -> bool:
+def _even(axis: SweepAxis) -> bool:
     """Return whether an axis is better linear, since its values are then more even."""
     places = View.places(axis)
     if not _wide(places):
@@ -137,7 +137,7 @@ def _even(axis: Axis) -> bool:
 
 
 def _map(
-        figure: style.Picture, panel: Axes, axes: tuple[Axis, Axis], name: str,
+        figure: style.Picture, panel: Axes, axes: tuple[SweepAxis, SweepAxis], name: str,
         values: Array) -> None:
     """Draw a map with contours, hatched where there is no plan."""
     places = [_scale(x.name) * View.places(x) for x in axes]
@@ -195,7 +195,7 @@ def _apart(place: int, count: int, points: int) -> tuple[int, int]:
 
 
 def _curves(
-        figure: style.Picture, panel: Axes, view: View, axis: Axis, name: str,
+        figure: style.Picture, panel: Axes, view: View, axis: SweepAxis, name: str,
         values: Array) -> None:
     """Draw curves over one axis, or bands of samples."""
     x = _scale(axis.name) * View.places(axis)

@@ -18,9 +18,9 @@ import pytest
 from hmsa.cli import main
 from hmsa.errors import BadInputError
 from hmsa.planning.shapers import SHAPERS
-from hmsa_studies import matrix, paper_data, robustness
+from hmsa_studies import feedback, paper_data, robustness
+from hmsa_studies.commanders import SCENARIOS, STRATEGIES
 from hmsa_studies.feedback import trial
-from hmsa_studies.scenario import SCENARIOS, STRATEGIES
 from hmsa_studies.schedulers import here, in_order, local
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -345,8 +345,8 @@ def test_sweep_ends_quietly_when_its_reader_has_gone():
 
 def test_robustness_with_feedback_compares_open_loop_with_corrections(run, monkeypatch):
     needs('pyarrow')
-    monkeypatch.setattr(matrix, 'ERRORS', ((-0.2, 0.2),))
-    monkeypatch.setattr(matrix.Matrix.__init__, '__defaults__', (
+    monkeypatch.setattr(feedback, 'ERRORS', ((-0.2, 0.2),))
+    monkeypatch.setattr(feedback.Matrix.__init__, '__defaults__', (
         SCENARIOS[1:2], STRATEGIES[1::5]))
     status, out, err = run('robustness', '--feedback', '--seeds', 1, '--json')
     assert (status, err) == (0, '')
@@ -367,7 +367,7 @@ def test_robustness_with_feedback_compares_open_loop_with_corrections(run, monke
 @pytest.mark.slow
 def test_trials_in_two_processes_make_the_same_matrix():
     needs('dask')
-    made = matrix.Matrix(2, SCENARIOS[:1], STRATEGIES[:2])
+    made = feedback.Matrix(2, SCENARIOS[:1], STRATEGIES[:2])
     done = []
     found = list(made.rows(in_order(local(2), trial, made.tasks, done.append)))
     assert found == list(made.rows(in_order(here, trial, made.tasks)))

@@ -21,9 +21,9 @@ from hmsa_lab.adapt.motion import follow, Levels
 from hmsa_lab.adapt.prior import Prior
 from hmsa_ros.runtime.loop import Loop
 from hmsa_ros.runtime.records import Settings, StretchRequest
+from hmsa_studies.commanders import scenario_of, SCENARIOS, STRATEGIES, Strategy
 from hmsa_studies.feedback import trial
 from hmsa_studies.linear import Linearised
-from hmsa_studies.scenario import scenario_of, SCENARIOS, STRATEGIES, Strategy
 
 TARGET, BEGIN, MS = 1.4, 50_000_000, 1_000_000
 

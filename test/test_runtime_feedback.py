@@ -25,7 +25,7 @@ from hmsa_ros.runtime.records import (
     StatusChanged,
     StretchRequest,
 )
-from hmsa_studies.scenario import SCENARIOS
+from hmsa_studies.commanders import SCENARIOS
 
 
 def estimates(loop):

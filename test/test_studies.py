@@ -28,7 +28,7 @@ from hmsa.model.status import Code
 from hmsa.planning.two_step import plan_two_step
 from hmsa_studies.__main__ import tables
 from hmsa_studies.axes import MOST_VALUES, parse_grid, read_cases
-from hmsa_studies.damped import damped_study, settling_time
+from hmsa_studies.moves import damped_study, ideal_move, sampled_study, settling_time
 from hmsa_studies.pictures import draw_damped, draw_front, draw_robustness, draw_sampled
 from hmsa_studies.residual import Actual, arrival_of, Errors
 from hmsa_studies.robustness import (
@@ -39,9 +39,8 @@ from hmsa_studies.robustness import (
     study,
     write_csv,
 )
-from hmsa_studies.sampled import ideal_move, sampled_study
+from hmsa_studies.study_folder import open_writer
 from hmsa_studies.sweep import Sweep
-from hmsa_studies.tables import open_writer
 
 COLUMNS = Sweep({}).columns
 DOCS = Path(__file__).resolve().parent.parent / 'docs' / 'validation' / 'robustness.md'

@@ -16,9 +16,8 @@ from hmsa.cli import main
 from hmsa.errors import BadInputError, HmsaError
 from hmsa_studies import schedulers, study_folder
 from hmsa_studies.commands.chunked import parse_shard
-from hmsa_studies.study_folder import LEAST_ROWS, RowStudy, StudyFolder
+from hmsa_studies.study_folder import LEAST_ROWS, open_writer, RowStudy, StudyFolder
 from hmsa_studies.sweep import parse_grid, Sweep
-from hmsa_studies.tables import open_writer
 
 needs('pyarrow')
 needs('dask')

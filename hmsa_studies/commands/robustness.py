@@ -26,7 +26,7 @@ from hmsa.files import json_text, make_folder
 from hmsa_studies.commands import chunked
 
 if TYPE_CHECKING:
-    from hmsa_studies.matrix import Row
+    from hmsa_studies.feedback import Row
     from hmsa_studies.robustness import Case, Result
     from hmsa_studies.schedulers import Start
 
@@ -261,9 +261,8 @@ def _print_table(case: 'Case', results: 'list[Result]', unit: float | None) -> N
 def _feedback(arguments: argparse.Namespace, start: 'Start', in_chunks: bool) -> int:
     """Compare open loop with feedback."""
     from hmsa.identification.files import read_belief
-    from hmsa_studies.feedback import trial
-    from hmsa_studies.matrix import left_of, Matrix
-    from hmsa_studies.scenario import scenario_of
+    from hmsa_studies.commanders import scenario_of
+    from hmsa_studies.feedback import left_of, Matrix, trial
     from hmsa_studies.schedulers import in_order
     from hmsa_studies.study_folder import StudyFolder
 

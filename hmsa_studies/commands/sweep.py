@@ -27,9 +27,9 @@ from hmsa_studies.commands import chunked
 
 if TYPE_CHECKING:
     from hmsa.model.equations import Array
+    from hmsa_studies.axes import View
     from hmsa_studies.study_folder import StudyFolder
     from hmsa_studies.sweep import Sweep
-    from hmsa_studies.views import View
 
 #: Time on one core, in s, up to which a sweep is planned at once, without chunks.
 _SMALL = 3.4
@@ -239,8 +239,7 @@ def _is_folder(out: Path) -> bool:
 
 
 def _plan_at_once(sweep: 'Sweep', out: Path | None, picture: _SweepPicture) -> int:
-    from hmsa_studies.study_folder import StudyFolder
-    from hmsa_studies.tables import open_writer
+    from hmsa_studies.study_folder import open_writer, StudyFolder
 
     counts: Counter[str] = Counter()
     with open_writer(out, sweep.columns) as write, \
