@@ -171,8 +171,8 @@ setup(
             'report/*.mplstyle'],
         'hmsa_ros': ['py.typed', '*.xml'],
         'hmsa_lab': [
-            'py.typed', 'bench/*.pyi', 'bench/hmsa_board/*', 'panel/index.html', 'panel/panel.*',
-            'report/*.html']},
+            'py.typed', 'bench/*.html', 'bench/*.pyi', 'bench/hmsa_board/*', 'panel/index.html',
+            'panel/panel.*']},
     ext_modules=[MOTION, RINGING, BOARD, DEADLINE],
     cmdclass={'build_ext': BuildMotion},
     data_files=[

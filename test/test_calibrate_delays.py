@@ -16,7 +16,7 @@ from hmsa.identification.measurement import Measurement
 from hmsa.model.parameters import paper_actuator
 from hmsa.runs.parameters import entries_of
 from hmsa_lab.bench.assembly import SensorScale
-from hmsa_lab.bench.statics import scale_at_rest, scale_by_gauge, statics
+from hmsa_lab.bench.calibration import scale_at_rest, scale_by_gauge, statics
 
 NOISE = 1e-3
 

@@ -131,7 +131,7 @@ def _coil(arguments: argparse.Namespace) -> int:
         if arguments.hysteresis:
             raise
     if arguments.picture:
-        from hmsa_lab.report.calibration import draw_coil
+        from hmsa_lab.bench.report import draw_coil
 
         draw_coil(arguments.picture, current, flux, found, paper)
     low, high = found.interval
@@ -338,7 +338,7 @@ def _latency(arguments: argparse.Namespace) -> int:
             bench, steps_of(actuator, arguments.limit, arguments.steps), probe, actuator,
             arguments.lag, update)
     if arguments.picture:
-        from hmsa_lab.report.calibration import draw_delays
+        from hmsa_lab.bench.report import draw_delays
 
         draw_delays(arguments.picture, found, paper)
     delays = {'transport': found.transport, 'lag': found.lag, 'latency': found.latency}
@@ -379,7 +379,7 @@ def _static(arguments: argparse.Namespace) -> int:
     paper, name = paper_of(arguments, *_files(arguments.out)), _checked(arguments, 3)
     if not 0.1 <= arguments.settle < math.inf:
         raise BadInputError(f'--settle is {arguments.settle:g} s: expected at least 0.1 s')
-    from hmsa_lab.bench.statics import scale_at_rest, scale_by_gauge, statics
+    from hmsa_lab.bench.calibration import scale_at_rest, scale_by_gauge, statics
     from hmsa_lab.experiments.calibrating import hold_staircase
 
     gauge = None if arguments.gauge is None else _made(arguments.gauge, '--gauge')
@@ -401,7 +401,7 @@ def _static(arguments: argparse.Namespace) -> int:
     else:
         scale = scale_at_rest(scale, found.rest)
     if arguments.picture:
-        from hmsa_lab.report.calibration import draw_statics
+        from hmsa_lab.bench.report import draw_statics
 
         draw_statics(arguments.picture, level, stretch, found, paper)
     sensor = {} if scale is None else {

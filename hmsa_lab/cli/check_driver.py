@@ -55,7 +55,7 @@ def run(arguments: argparse.Namespace) -> int:
             arguments.hardware, arguments.joint, settings, level=arguments.limit,
             rate=arguments.rate).run(update)
     if arguments.report is not None:
-        from hmsa_lab.report.conformance import page
+        from hmsa_lab.bench.report import page
 
         write_text(arguments.report, page(found))
     show(

@@ -1,10 +1,13 @@
-"""The panel's access to ROS, in one thread that never blocks."""
+"""The panel's access to ROS, in one thread that never blocks; its recordings and interlock."""
 
 from collections.abc import Callable, Mapping, Sequence
 import json
 import math
 from pathlib import Path
 from queue import Empty
+import subprocess
+import sys
+import threading
 from time import monotonic
 from typing import Any
 
@@ -12,23 +15,29 @@ from diagnostic_msgs.msg import DiagnosticArray
 import numpy as np
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import GetParameters, SetParameters
+from rclpy.node import Node
 from rclpy.parameter import parameter_value_to_python
+from std_msgs.msg import Bool
 
 from hmsa.ending import ENDING
 from hmsa.errors import BadInputError, HmsaError, printable
 from hmsa.files import finite
 from hmsa.interfaces import topics
 from hmsa.interfaces.status import real, texts
-from hmsa_lab.panel.interlock import InterlockSwitch
-from hmsa_lab.panel.recorder import PanelRecorder
+from hmsa.interfaces.topics import DRIVER, INTERLOCK, RECORDER
 from hmsa_lab.panel.server import Server
 from hmsa_lab.watch.listener import Listener
 from hmsa_lab.watch.scene import as_json, LEVELS, PeakHistory, Scene, SLOTS
 from hmsa_ros.clients.client import PlannerClient
+from hmsa_ros.clients.experiment import Experiment, prepare, recorder_of
 from hmsa_ros.clients.link import Stopping
+from hmsa_ros.clients.processes import dated, Session
 from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.service_call import ServiceCall
 from hmsa_ros.runtime.records import FEEDBACK_MODES as MODES
+
+# Interval of repeats in s, well within the default interlock_timeout of a driver.
+_REPEAT_SECONDS = 0.1
 
 # Frame interval in s; number of chart slots in a frame; time in s for which a new page gets all.
 _PERIOD, _TAIL, _NEW_SECONDS = 0.02, 24, 1.0
@@ -37,6 +46,107 @@ _RELOAD_SECONDS, _GONE_SECONDS = 1.0, 10.0
 _ASK_SECONDS = 1.0
 _RESTING = ('at_rest', 'idle')
 _WARN = 1
+
+
+class InterlockSwitch:
+    """
+    Open and close the interlock of a driver, once asked to.
+
+    A message is repeated while the panel runs. An opening outlasts the panel: a driver keeps its
+    interlock open until another publisher closes it.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node, self._publisher = node, ros_entities.publisher(node, INTERLOCK, DRIVER)
+        self.closed: bool | None = None  #: as last requested; None before the first request
+        self._next = math.inf
+
+    @property
+    def present(self) -> bool:
+        """Whether a driver listens."""
+        return ros_entities.heard(self._node, self._publisher)
+
+    def turn(self, now: float, *, closed: bool) -> None:
+        """Open or close it, from a time in s on."""
+        self.closed, self._next = closed, now
+        self.repeat(now)
+
+    def repeat(self, now: float) -> None:
+        """Repeat the last message when it is time."""
+        if self.closed is not None and now >= self._next:
+            self._publisher.publish(Bool(data=self.closed))
+            self._next = now + _REPEAT_SECONDS
+
+
+class PanelRecorder:
+    """
+    Record to new folders in ``base``, in a separate process; another one makes the report.
+
+    ``state`` is off, on, closing or reporting; ``trouble`` contains the last error.
+    """
+
+    def __init__(self, base: Path, namespace: str, joints: tuple[str, ...]) -> None:
+        self._base, self._namespace, self._joints = base, namespace, joints
+        self.state = 'off'
+        self.trouble = ''
+        self.bag: Path | None = None
+        self.since = 0.0
+        self.report: Path | None = None
+        self._session: Session | None = None
+        self._worker: threading.Thread | None = None
+        self._ending = False
+
+    def start(self, simulated: bool) -> None:
+        """Start, in simulated time if ``simulated``; raise `HmsaError` if that is impossible."""
+        if self.state != 'off':
+            raise HmsaError(f'the recording is {self.state}: expected none')
+        folder = dated(self._base).resolve()
+        prepare(folder)
+        experiment = Experiment(
+            folder, (), namespace=self._namespace, joints=self._joints)
+        self._session = Session(folder)
+        self._session.start(recorder_of(experiment, simulated))
+        self.state, self.bag, self.since = 'on', experiment.bag, monotonic()
+        self.trouble, self.report = '', None
+
+    def check(self) -> None:
+        """Detect an early end of the recorder."""
+        try:
+            if self.state == 'on' and self._session is not None:
+                self._session.check()
+        except HmsaError as error:
+            self.state, self.trouble = 'off', str(error)
+
+    def stop(self) -> None:
+        """Close the bag and make its report, without waiting."""
+        if self.state == 'on' and self._session is not None and self.bag is not None:
+            self.state = 'closing'
+            self._worker = threading.Thread(
+                target=self._finish, args=(self._session, self.bag), daemon=True)
+            self._worker.start()
+
+    def close(self) -> None:
+        """Close an open bag and wait for that, but not for a report."""
+        self._ending = True
+        self.stop()
+        while self._worker is not None and self.state == 'closing':
+            self._worker.join(0.1)
+
+    def _finish(self, session: Session, bag: Path) -> None:
+        if session.stop()[RECORDER]:
+            self.trouble = f'the recorder failed: {session.last_words(RECORDER)}'
+        elif not self._ending:
+            self.state = 'reporting'
+            page = bag.parent / 'report.html'
+            done = subprocess.run(
+                [sys.executable, '-m', 'hmsa_ros', 'report', bag, '--out', page],
+                capture_output=True, text=True, errors='replace', start_new_session=True,
+                check=False)
+            if done.returncode:
+                self.trouble = ' '.join(done.stderr.split()[-60:]) or 'the report failed'
+            else:
+                self.report = page
+        self.state = 'off'
 
 
 class Desk:

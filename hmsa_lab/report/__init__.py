@@ -1,1 +1,0 @@
-"""Pages of a calibration and of a conformance test."""
