@@ -20,9 +20,8 @@ from hmsa import __version__
 from hmsa.bag import metadata, qos
 from hmsa.bag.metadata import BagTopic
 from hmsa.bag.output import Entry, OutputFile, PRESETS
-from hmsa.bag.reader import BagReader
+from hmsa.bag.reader import BagReader, number_of
 from hmsa.bag.records import MESSAGE_HEAD
-from hmsa.bag.topics import number_of
 from hmsa.errors import BadInputError, BagError
 
 __all__ = ['BagWriter', 'MIN_FILE_SIZE', 'parse_custom_data', 'PRESETS', 'BagTopic']

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 from hmsa.bag.metadata import BagTopic
 from hmsa.bag.output import Entry
-from hmsa.bag.topics import number_of
+from hmsa.bag.reader import number_of
 from hmsa.bag.writer import BagWriter, MIN_FILE_SIZE
 from hmsa.errors import BadInputError, BagError
 
