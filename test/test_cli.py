@@ -20,7 +20,7 @@ import pytest
 
 from hmsa.cli import build_parser, main, split_ros_args
 from hmsa.cli.completion import commands_of
-from hmsa.cli.progress import progress
+from hmsa.cli.terminal import progress
 from hmsa.planning.shapers import SHAPERS
 
 TOLERANCE = 1e-9
@@ -411,7 +411,7 @@ def on_terminal(code, **env):
 
 
 PROGRESS = """
-from hmsa.cli.progress import progress
+from hmsa.cli.terminal import progress
 with progress('waiting') as update:
     update('drawing', 0.5)
 print('done')

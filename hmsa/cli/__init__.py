@@ -16,8 +16,7 @@ import sys
 from typing import Any, NoReturn
 
 from hmsa import __version__
-from hmsa.cli.notes import collecting, show_notes, unshown
-from hmsa.cli.output import tolerate
+from hmsa.cli.terminal import collecting, show_notes, tolerate, unshown
 from hmsa.ending import ENDING
 from hmsa.errors import complain, HmsaError
 from hmsa.plugins import COMMANDS, registered

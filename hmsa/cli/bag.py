@@ -15,7 +15,7 @@ from typing import Any
 
 from hmsa.bag.limits import CHUNK_SIZE, MEBIBYTE
 from hmsa.cli.options import add_command, JSON, show
-from hmsa.cli.progress import progress
+from hmsa.cli.terminal import progress
 from hmsa.errors import BadInputError, printable
 
 _LARGEST_CHUNK = 65536

@@ -16,7 +16,7 @@ from typing import Any, TYPE_CHECKING
 
 from hmsa.cli.options import add_command, bags, JSON, show
 from hmsa.cli.pictures import paper_of, picture_options
-from hmsa.cli.progress import progress
+from hmsa.cli.terminal import progress
 from hmsa.errors import BadInputError
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise BadInputError(
             f'only {arguments.runs[0]} is given: expected two runs or more, such as hmsa compare '
             'first/run second/run')
-    from hmsa.report.repeats import repeats_in
+    from hmsa.report.comparison import repeats_in
 
     repeats = [repeats_in(x) for x in arguments.runs]
     if any(repeats):
@@ -63,7 +63,7 @@ def _compare_repeats(
         arguments: argparse.Namespace, groups: 'list[list[Path]]', paper: 'Paper') -> int:
     """Compare runs of which at least one was repeated."""
     from hmsa.report.arrivals import Part
-    from hmsa.report.repeats import statistics, statistics_table
+    from hmsa.report.comparison import statistics, statistics_table
     from hmsa.runs.bags import read_run
 
     labels = [x.parent.name if x.name == 'run' else x.name for x in map(

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from hmsa.cli.options import add_command
-from hmsa.cli.progress import progress
+from hmsa.cli.terminal import progress
 
 
 def add_parser(subparsers: Any) -> None:

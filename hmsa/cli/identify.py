@@ -17,7 +17,7 @@ import sys
 from typing import Any, TYPE_CHECKING
 
 from hmsa.cli.options import add_command, JSON, of_unit, show, temperature_option
-from hmsa.cli.progress import progress
+from hmsa.cli.terminal import progress
 from hmsa.errors import BadInputError, meant
 from hmsa.files import check_targets, may_be_bag, write_text
 from hmsa.interfaces.quantities import number_of

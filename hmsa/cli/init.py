@@ -261,7 +261,7 @@ def _joints(joints: list[str], block: 'ActuatorParameters') -> list[str]:
 
 def _sampling(actuator: 'ActuatorParameters') -> list[str]:
     """Return lines with the plant's sample rate if the default misses the actuator's peaks."""
-    from hmsa.model.sampling import enough_samples
+    from hmsa.interfaces.actuator import enough_samples
 
     default, largest = cast(float, PUBLISH_RATE.default), cast(float, PUBLISH_RATE.maximum)
     # Twice the rate that just resolves the peaks, if a plant sustains it in real time.

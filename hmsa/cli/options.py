@@ -188,7 +188,7 @@ def show(
         arguments: argparse.Namespace, record: dict[str, Any], *lines: object,
         written: Iterable[Path | None] = ()) -> int:
     """Print a result as JSON with --json, otherwise as lines with the files written; return 0."""
-    from hmsa.cli.notes import show_notes, with_notes
+    from hmsa.cli.terminal import show_notes, with_notes
     from hmsa.files import json_text
 
     show_notes()

@@ -24,8 +24,8 @@ from hmsa.cli.options import (
     show,
     temperature_option,
 )
-from hmsa.cli.progress import progress
 from hmsa.cli.setpoints import setpoint
+from hmsa.cli.terminal import progress
 from hmsa.errors import BadInputError
 from hmsa.files import check_targets
 from hmsa.table import Column, Table

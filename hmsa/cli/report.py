@@ -14,7 +14,7 @@ from typing import Any, TYPE_CHECKING
 
 from hmsa.cli.options import add_command, bags, show
 from hmsa.cli.pictures import paper_of, picture_options
-from hmsa.cli.progress import progress
+from hmsa.cli.terminal import progress
 from hmsa.files import write_text
 
 if TYPE_CHECKING:

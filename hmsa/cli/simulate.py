@@ -15,7 +15,7 @@ from typing import Any
 
 from hmsa.cli.options import actuator_of, add_command, EXAMPLE, frequency, JSON, show
 from hmsa.cli.pictures import paper_of, picture_options
-from hmsa.cli.progress import progress
+from hmsa.cli.terminal import progress
 
 
 def add_parser(subparsers: Any) -> None:

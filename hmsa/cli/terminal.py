@@ -7,18 +7,18 @@ about every two seconds. Assumptions and doubts of a command are told once each:
 a note in its JSON. Characters that the encoding of standard output lacks must not end a command.
 """
 
-from collections.abc import Callable, Iterator
+import codecs
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from io import TextIOWrapper
 import math
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping
 from typing import Any, TextIO
 import warnings
+
 from hmsa.errors import AssumedWarning, MissingWarning, printable, UnusualWarning
-import codecs
-from io import TextIOWrapper
 
 #: Seconds of silence after which `progress` says what is under way.
 PATIENCE = 1.5

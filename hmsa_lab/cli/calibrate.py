@@ -16,7 +16,7 @@ from typing import Any, TYPE_CHECKING
 
 from hmsa.cli.options import add_command, assume_example, JSON, Row, show
 from hmsa.cli.pictures import paper_of, picture_options
-from hmsa.cli.progress import PATIENCE, progress
+from hmsa.cli.terminal import PATIENCE, progress
 from hmsa.errors import BadInputError, HmsaError
 from hmsa.files import check_targets, write_text, yaml_text
 from hmsa.interfaces.quantities import number_of

@@ -14,7 +14,7 @@ import sys
 from typing import Any
 
 from hmsa.cli.options import add_command, frequency, JSON, show
-from hmsa.cli.progress import PATIENCE, progress
+from hmsa.cli.terminal import PATIENCE, progress
 from hmsa.errors import BadInputError
 from hmsa.files import check_targets, write_text
 

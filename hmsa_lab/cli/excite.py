@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from hmsa.cli.options import add_command, assume_example, frequency, JSON, show
-from hmsa.cli.progress import PATIENCE, progress
+from hmsa.cli.terminal import PATIENCE, progress
 from hmsa.files import check_targets, write_text
 from hmsa.table import Column, Table
 

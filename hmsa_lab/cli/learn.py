@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from hmsa.cli.options import add_command, bags, JSON, show
-from hmsa.cli.progress import progress
+from hmsa.cli.terminal import progress
 from hmsa.files import check_targets, write_text
 
 

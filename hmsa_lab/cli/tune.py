@@ -15,10 +15,9 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from hmsa.cli.identify import known_of
-from hmsa.cli.notes import show_notes
 from hmsa.cli.options import add_command, argument, assume_example, NAMESPACE, show
-from hmsa.cli.progress import PATIENCE, progress
 from hmsa.cli.setpoints import setpoint_of_joints
+from hmsa.cli.terminal import PATIENCE, progress, show_notes
 from hmsa.ending import ENDING
 from hmsa.errors import BadInputError
 from hmsa.files import check_targets, write_text

@@ -15,7 +15,7 @@ import sys
 from typing import Any
 
 from hmsa.cli.options import add_command, show
-from hmsa.cli.progress import PATIENCE, progress
+from hmsa.cli.terminal import PATIENCE, progress
 from hmsa.ending import ENDING
 from hmsa.table import Column, Table
 

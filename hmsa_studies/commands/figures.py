@@ -13,7 +13,7 @@ from typing import Any
 
 from hmsa.cli.options import add_command
 from hmsa.cli.pictures import formats_of, paper_of, picture_options
-from hmsa.cli.progress import PATIENCE, progress
+from hmsa.cli.terminal import PATIENCE, progress
 from hmsa.files import make_folder
 
 
