@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from hmsa.errors import BadInputError
+from hmsa.interfaces.actuator import enough_samples, too_few_samples
 from hmsa.model.actuators import Setup
 from hmsa.model.parameters import paper_actuator
-from hmsa.model.sampling import enough_samples, too_few_samples
 from hmsa.model.simulation import ActuatorSimulation
 from hmsa_ros.device.health import judge_commands
 from hmsa_ros.device.protocol import Kind, Sample

@@ -18,8 +18,7 @@ import yaml
 from hmsa import Actuator, plugins
 from hmsa.errors import BadInputError
 from hmsa.interfaces.actuator import actuator_from
-from hmsa.interfaces.parameters import ACTUATOR, BLOCK, ParameterSpec
-from hmsa.interfaces.sections import is_for, sections_of
+from hmsa.interfaces.parameters import ACTUATOR, BLOCK, is_for, ParameterSpec, sections_of
 from hmsa.interfaces.topics import NODES
 from hmsa.model.parameters import ActuatorParameters, paper_actuator
 from hmsa.plugins import registered

@@ -1,10 +1,11 @@
 """
 Parameters shared by nodes, files and reports: name, default, unit, range and description.
 
-`ParameterSpec` is one entry. Parameters of a single node are declared in its module.
+`ParameterSpec` is one entry. Parameters of a single node are declared in its module. The sections
+of a parameter file, and the nodes that read them, follow the rules of ROS 2.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 import math
@@ -24,6 +25,8 @@ Value = bool | int | float | str | list[str] | list[float]
 
 # Numbers that PyYAML reads as text, and ROS 2 as numbers.
 _POWER = re.compile(r'[+-]?(\d+\.?\d*|\.\d+)[eE][+-]?\d+', re.ASCII)
+
+_KEY = 'ros__parameters'
 
 
 def number_of(value: object) -> float | None:
@@ -386,3 +389,22 @@ MISMATCH = tuple(
 
 #: Fields of `hmsa.model.parameters.ActuatorParameters` that are parameters.
 ACTUATOR_FIELDS = tuple(spec.name.partition('.')[2] for spec in ACTUATOR)
+
+
+def sections_of(document: Any, name: str = '') -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """Yield the full name and the parameters of each section, such as ``/**`` or ``/planner``."""
+    if not isinstance(document, Mapping):
+        return
+    for key, values in document.items():
+        if key == _KEY:
+            yield name or '/', values if isinstance(values, Mapping) else {}
+        else:
+            yield from sections_of(values, f'{name}/{str(key).strip("/")}')
+
+
+def is_for(section: str, node: str) -> bool:
+    """Return whether a node with this full name reads a section; ``*`` is any one name."""
+    tokens = section.strip('/').split('/')
+    return re.fullmatch(''.join(
+        '(?:/[^/]+)*' if x == '**' else '/[^/]+' if x == '*' else f'/{re.escape(x)}'
+        for x in tokens), node) is not None

@@ -11,8 +11,7 @@ from hmsa.errors import assume, BadInputError, BagError, excerpt
 from hmsa.files import read_at_most
 from hmsa.interfaces import parameters as shared
 from hmsa.interfaces.actuator import actuator_from, creep_from
-from hmsa.interfaces.parameters import number_of, ParameterSpec
-from hmsa.interfaces.sections import sections_of
+from hmsa.interfaces.parameters import number_of, ParameterSpec, sections_of
 from hmsa.interfaces.topics import NODES, PLANNER, PLANT
 from hmsa.model.creep import Creep
 from hmsa.model.parameters import ActuatorParameters, paper_actuator

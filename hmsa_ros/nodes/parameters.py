@@ -26,8 +26,15 @@ from hmsa.errors import BadInputError, HmsaError, listed
 from hmsa.files import read_at_most
 from hmsa.interfaces import topics
 from hmsa.interfaces.actuator import completed
-from hmsa.interfaces.parameters import FIXED, JOINT, LAW, ParameterSpec, present_name
-from hmsa.interfaces.sections import is_for, sections_of
+from hmsa.interfaces.parameters import (
+    FIXED,
+    is_for,
+    JOINT,
+    LAW,
+    ParameterSpec,
+    present_name,
+    sections_of,
+)
 from hmsa.plugins import NODES, registered
 
 # A parameter file that is larger is not looked at again.

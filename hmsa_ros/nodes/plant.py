@@ -14,11 +14,9 @@ from sensor_msgs.msg import Temperature
 from hmsa.errors import BadInputError
 from hmsa.interfaces import parameters as shared
 from hmsa.interfaces import topics
-from hmsa.interfaces.actuator import planned_from
+from hmsa.interfaces.actuator import planned_from, too_few_samples
 from hmsa.interfaces.parameters import ParameterSpec
 from hmsa.model.actuators import Setup, unheld
-from hmsa.model.real_time_factor import RealTimeFactor
-from hmsa.model.sampling import too_few_samples
 from hmsa.model.units import NANOSECONDS
 from hmsa_ros.device.sensor import SensorErrors
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
@@ -34,7 +32,7 @@ from hmsa_ros.nodes.markers import (
 )
 from hmsa_ros.nodes.parameters import declare_joints, JointParameters
 from hmsa_ros.nodes.runner import run
-from hmsa_ros.timekeeping import StepWatch
+from hmsa_ros.timekeeping import RealTimeFactor, StepWatch
 
 #: Parameters that may have a separate value for each joint.
 OWN = (
