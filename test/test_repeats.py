@@ -10,7 +10,7 @@ from test_report import ACTUATOR, parameters, simulated, write
 
 import hmsa
 from hmsa.cli import main
-from hmsa.report.repeats import repeats_in
+from hmsa.report.comparison import repeats_in
 
 MODULI = {'before': (1.02, 1.04, 1.06), 'after': (0.999, 1.0, 1.001)}
 

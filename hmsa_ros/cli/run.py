@@ -17,10 +17,9 @@ from pathlib import Path
 import sys
 from typing import Any, TYPE_CHECKING
 
-from hmsa.cli.notes import show_notes, with_notes
 from hmsa.cli.options import add_command, assume_example, JOINTS, NAMESPACE
-from hmsa.cli.progress import PATIENCE, progress
 from hmsa.cli.setpoints import SEQUENCE, sequence_of
+from hmsa.cli.terminal import PATIENCE, progress, show_notes, with_notes
 from hmsa.ending import ENDING
 from hmsa.errors import BadInputError
 from hmsa.files import json_text, write_text
@@ -113,7 +112,7 @@ def run(arguments: argparse.Namespace) -> int:
             'notes': done.notes, 'exits': done.exits, 'bag': experiment.bag, 'report': report})
         if not arguments.json:
             _print(experiment, parts, levels, reason, done, report)
-    from hmsa.report.repeats import statistics, statistics_table
+    from hmsa.report.comparison import statistics, statistics_table
     if arguments.json:
         print(json_text(with_notes(records[0] if arguments.repeat == 1 else {
             'repeats': records, 'statistics': statistics(each)})))
