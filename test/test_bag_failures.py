@@ -17,11 +17,11 @@ import pytest
 from hmsa.bag import metadata
 from hmsa.bag.output import OutputFile
 from hmsa.bag.reader import BagReader
+from hmsa.bag.reception import judge, WARN
 from hmsa.bag.recover import recover
 from hmsa.bag.writer import BagTopic, BagWriter
+from hmsa.bag.writer_thread import lost_by_topic, RecordingLimits, WriterThread
 from hmsa.errors import BadInputError, BagError
-from hmsa_ros.recording.reception import judge, WARN
-from hmsa_ros.recording.writer_thread import lost_by_topic, RecordingLimits, WriterThread
 
 TOPIC = BagTopic('/a', 'std_msgs/msg/UInt8', 'uint8 data\n')
 PAYLOAD = bytes((0, 1, 0, 0, 7))
@@ -293,7 +293,7 @@ def test_time_that_jumps_to_and_fro_does_not_make_a_file_each_time(tmp_path):
 
 @pytest.mark.slow
 def test_an_end_that_takes_too_long_is_cut_off_and_counted(tmp_path, monkeypatch):
-    monkeypatch.setattr('hmsa_ros.recording.writer_thread.END_SECONDS', 0.0)
+    monkeypatch.setattr('hmsa.bag.writer_thread.END_SECONDS', 0.0)
     recording = WriterThread(BagWriter(tmp_path / 'bag'), RecordingLimits())
     recording.add_topic(TOPIC)
     for i in range(200_000):

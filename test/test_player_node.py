@@ -19,12 +19,12 @@ from std_srvs.srv import Trigger
 
 from hmsa.bag.definitions import message_definition, type_hash
 from hmsa.bag.info import summarize
+from hmsa.bag.playback import PlaybackClock
 from hmsa.bag.qos import Qos
 from hmsa.bag.writer import BagTopic, BagWriter
 from hmsa.cli import main
 from hmsa.interfaces import topics
 from hmsa_ros.clients.launching import REPLAY
-from hmsa_ros.recording.playback import PlaybackClock
 
 pytestmark = pytest.mark.ros
 FLOAT = 'std_msgs/msg/Float64'

@@ -7,10 +7,10 @@ from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 from std_msgs.msg import Float64
 
+from hmsa.bag.reception import RecordedTopic
 from hmsa_ros.nodes import subscribing
 from hmsa_ros.nodes.capture import Capture, RawSubscription, SimulatedTime
 from hmsa_ros.nodes.selection import Selection
-from hmsa_ros.recording.reception import RecordedTopic
 
 TALKER = Path(__file__).parent / 'talker.py'
 

@@ -1,5 +1,5 @@
 """
 MCAP bags in the layout of rosbag2 (Jazzy).
 
-Reading and writing do not need ROS and do not import rclpy.
+Reading, writing and playing do not need ROS and do not import rclpy.
 """

@@ -24,6 +24,13 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.duration import Duration
 from rclpy.expand_topic_name import expand_topic_name
 
+from hmsa.bag.playback import (
+    CLOCK_WHILE_WAITING_SECONDS,
+    ClockOut,
+    Excerpt,
+    PlaybackClock,
+    Sender,
+)
 from hmsa.bag.reader import BagReader
 from hmsa.errors import BadInputError, BagError, HmsaError, listed
 from hmsa.interfaces import topics
@@ -42,13 +49,6 @@ from hmsa_ros.nodes.playback_publishers import (
 )
 from hmsa_ros.nodes.runner import run
 from hmsa_ros.nodes.selection import Filter
-from hmsa_ros.recording.playback import (
-    CLOCK_WHILE_WAITING_SECONDS,
-    ClockOut,
-    Excerpt,
-    PlaybackClock,
-    Sender,
-)
 
 _POLL_SECONDS = 0.02
 # Reliable messages that found the receiver's queue full are sent again when a heartbeat of Fast

@@ -24,7 +24,9 @@ from rosgraph_msgs.msg import Clock
 
 from hmsa import __version__
 from hmsa.bag.output import PRESETS
+from hmsa.bag.reception import figures, judge, RecordedTopic
 from hmsa.bag.writer import BagWriter, parse_custom_data
+from hmsa.bag.writer_thread import lost_by_topic, RecordingLimits, Status, WriterThread
 from hmsa.errors import BadInputError, BagError
 from hmsa.interfaces import topics
 from hmsa.interfaces.parameters import duration_from, duration_specs, ParameterSpec
@@ -39,8 +41,6 @@ from hmsa_ros.nodes.runner import run
 from hmsa_ros.nodes.selection import Selection
 from hmsa_ros.nodes.service_call import RemoteParameters
 from hmsa_ros.nodes.subscribing import Subscriptions
-from hmsa_ros.recording.reception import figures, judge, RecordedTopic
-from hmsa_ros.recording.writer_thread import lost_by_topic, RecordingLimits, Status, WriterThread
 from hmsa_ros.timekeeping import StepWatch
 
 PARAMETERS = (

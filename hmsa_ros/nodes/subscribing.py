@@ -8,14 +8,14 @@ from rclpy.qos import QoSProfile
 
 from hmsa.bag.definitions import message_definition, type_hash
 from hmsa.bag.qos import Qos
+from hmsa.bag.reception import RecordedTopic
 from hmsa.bag.writer import BagTopic
+from hmsa.bag.writer_thread import WriterThread
 from hmsa.errors import BagError
 from hmsa_ros.nodes.capture import Capture, RawSubscription
 from hmsa_ros.nodes.qos import stored, subscription
 from hmsa_ros.nodes.ros_entities import interface_class
 from hmsa_ros.nodes.selection import Selection
-from hmsa_ros.recording.reception import RecordedTopic
-from hmsa_ros.recording.writer_thread import WriterThread
 
 # Share of the memory for waiting messages that the queues of the middleware may take: these serve
 # while the recorder gets no processor, its own queue while the disk is slow.

@@ -7,7 +7,7 @@ from typing import Any
 
 from hmsa.bag.output import Entry
 from hmsa.bag.qos import Qos
-from hmsa_ros.recording.writer_thread import Status
+from hmsa.bag.writer_thread import Status
 
 OK, WARN, ERROR = range(3)
 # Messages always wait for a flush: longer delays, in flush periods and in s, are reported.

@@ -1,1 +1,0 @@
-"""Recording messages to a bag, and playing them."""
