@@ -317,7 +317,7 @@ def test_what_is_sent_arrives_once_in_order_and_its_delay_later(waits, delay):
     for wait in waits:
         now += wait
         came += transport.arrived(now)
-        transport.send(now, len(sent))
+        transport.put(now, len(sent))
         sent.append((now + delay, len(sent)))
         assert came == [x for x in sent if x[0] <= now and x in came]
     came += transport.arrived(now + delay)

@@ -76,7 +76,7 @@ def _carry_out(
         print(
             f'simulated time runs at {pace:.3g} of real time: the sequence of {length:g} s takes '
             f'about {length / pace:.2g} s', file=sys.stderr, flush=True)
-    verdict = client.send(arguments.setpoints, levels, path)
+    verdict = client.send_sequence(arguments.setpoints, levels, path)
     print(verdict.message, flush=True)
     if not arguments.wait:
         return

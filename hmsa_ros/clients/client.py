@@ -197,7 +197,7 @@ class PlannerClient(Link):
         """Return the command topics without subscribers other than recorders."""
         return unheard(self.node, self._namespace, self._joints)
 
-    def send(
+    def send_sequence(
             self, setpoints: Sequence[tuple[float | Sequence[float], float]],
             levels: Sequence[tuple[float, float]] = (),
             path: Sequence[Sequence[float]] = ()) -> StatusVerdict:
@@ -251,7 +251,7 @@ class PlannerClient(Link):
             levels: Sequence[tuple[float, float]] = (),
             path: Sequence[Sequence[float]] = ()) -> str:
         """
-        Send a sequence as `send` does, without waiting; return the name of the request.
+        Send a sequence as `send_sequence` does, without waiting; return the name of the request.
 
         Raises
         ------
@@ -311,7 +311,7 @@ class PlannerClient(Link):
         Parameters
         ----------
         verdict : Verdict
-            The verdict returned by `send`.
+            The verdict returned by `send_sequence`.
         each : callable, optional
             Called about 20 times a second with the newest verdict.
         timeout : float

@@ -228,7 +228,7 @@ def _carry_out(
         experiment: Experiment, watch: 'ExperimentClient', progress: ExperimentProgress
 ) -> StatusVerdict:
     """Send the sequence, and wait until the duration of the last setpoint is over."""
-    verdict = watch.send(experiment.setpoints, experiment.levels, experiment.path)
+    verdict = watch.send_sequence(experiment.setpoints, experiment.levels, experiment.path)
     begin = watch.now
     lead = watch.parameter('planner.lead_time')
     total = experiment.duration + (

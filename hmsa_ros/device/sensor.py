@@ -31,7 +31,7 @@ class Delay(Generic[T]):
         self.delay = delay
         self._moving: deque[tuple[int, T]] = deque()
 
-    def send(self, now: int, thing: T) -> None:
+    def put(self, now: int, thing: T) -> None:
         """Send an item at a time in ns, not before the previous one."""
         self._moving.append((now + self.delay, thing))
 
@@ -115,6 +115,6 @@ class Sensor:
                     self._deviations.shape)
                 stretch, rate = stretch + errors[0], rate + errors[1]
             sample = sample._replace(stretch=stretch, rate=rate)
-        self._transport.send(sample.time, sample)
+        self._transport.put(sample.time, sample)
         for _, measured in self._transport.arrived(sample.time):
             yield measured

@@ -123,7 +123,7 @@ class SimulatedDevice(Device):
         self._check_clock(stamp)
         if self._transit.delay:
             self._actuators.setups[joint].check_level(level)
-            self._transit.send(self.time, (joint, stamp, level))
+            self._transit.put(self.time, (joint, stamp, level))
         else:
             self._obey(joint, stamp, level)
 

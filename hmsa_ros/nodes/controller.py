@@ -48,7 +48,7 @@ class LinkedPlanner(PlannerNode):
         given = self._parameter_overrides
         return any(x in given and given[x].value for x in (HARDWARE.name, SHORT))
 
-    def send(self) -> None:
+    def pass_on(self) -> None:
         """Pass the commands that are due to the device."""
         if self._channels:
             self._take(self._runtime.send(self.now()))
@@ -162,7 +162,7 @@ class Linked(DeviceNode):
                 self._go_on()
                 for joint in self._joints:
                     self._planner.take_refusal(joint.name, joint.refuses, joint.cut_off_time)
-            self._planner.send()
+            self._planner.pass_on()
         if self._joints:
             self._poll_commands()
             self._publish_news()
