@@ -11,10 +11,9 @@ from scipy.integrate import solve_ivp
 from hmsa.model.delivery import Delivery, ramps
 from hmsa.model.equations import elastic_force
 from hmsa.model.moves import Level, Limits, Setpoint, State
-from hmsa.model.parameters import NondimensionalParameters, paper_actuator
-from hmsa.model.simulation import ActuatorSimulation, sampled
+from hmsa.model.parameters import NondimensionalParameters
+from hmsa.model.simulation import sampled
 from hmsa.model.status import Code, RefusedError
-from hmsa.planning.planner import Options, Planner
 from hmsa.planning.sequence import plan_sequence
 from hmsa.planning.shapers import get_shaper
 from hmsa.planning.shapers.request import MoveRequest
@@ -124,37 +123,3 @@ def test_predicted_motion_under_a_lag_is_that_of_the_independent_integration(sle
     assert late[0] == pytest.approx(solve_ivp(
         rates, (0.0, 1.0), [1.0, 0.0, 0.0], method='DOP853', rtol=1e-12, atol=1e-13,
         args=(1.0, 0.0, 0.2)).y[0, -1], abs=1e-10)
-
-
-@pytest.mark.parametrize('options', [
-    {}, {'period': MS}, {'slew_limit': 60.0}, {'shaper': 'robust'}, {'shaper': 'minimum_time'},
-    {'shaper': 'minimum_time', 'period': MS}], ids=str)
-def test_pre_emption_and_stop_through_a_slow_coil_leave_no_vibration_behind(options):
-    planner = Planner(paper_actuator(), Options(
-        flux_density_min=-0.5, flux_density_max=0.5, lead_time=MS, coil_time_constant=5e-4,
-        **options))
-    plant = ActuatorSimulation(
-        paper_actuator(), slew_limit=options.get('slew_limit', math.inf),
-        coil_time_constant=5e-4)
-    requests = {0: 1.4, 3: 0.9, 7: 1.2, 8: 1.25, 60: 1.3, 63: 'stop'}
-    samples = []
-    for time in range(160):
-        now = time * MS
-        request = requests.get(time)
-        if request == 'stop':
-            planner.stop(now)
-        elif request is not None:
-            planner.setpoint(request, now)
-        for level in planner.due(now):
-            assert plant.command(level.stamp, level.flux_density) == 0
-            assert level.stamp % options.get('period', 1) == 0
-            assert -0.5 <= level.flux_density <= 0.5
-        plant.advance(now)
-        predicted = planner.state(now)
-        assert predicted.stretch == pytest.approx(plant.stretch, abs=1e-9)
-        assert predicted.load * paper_actuator().flux_density_unit == pytest.approx(
-            plant.flux_density, abs=1e-9)
-        samples.append(plant.stretch)
-    assert planner.plan.segments[-1].arrival is not None
-    assert np.ptp(samples[58:60]) < 1e-6
-    assert np.ptp(samples[-40:]) < 1e-6

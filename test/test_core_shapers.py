@@ -396,13 +396,18 @@ def test_a_sequence_begins_each_move_where_the_last_one_really_ended():
 
 @pytest.mark.parametrize('options', [
     {}, {'period': MILLISECOND}, {'slew_limit': 20.0}, {'shaper': 'robust'},
-    {'shaper': 'minimum_time'}, {'period': MILLISECOND, 'slew_limit': 60.0}], ids=str)
+    {'shaper': 'minimum_time'}, {'period': MILLISECOND, 'slew_limit': 60.0}, *(
+        {'coil_time_constant': 5e-4, **x} for x in (
+            {}, {'period': MILLISECOND}, {'slew_limit': 60.0}, {'shaper': 'robust'},
+            {'shaper': 'minimum_time'}, {'shaper': 'minimum_time', 'period': MILLISECOND}))],
+    ids=str)
 def test_pre_emption_and_stop_leave_no_vibration_behind(options):
-    slew = options.get('slew_limit', math.inf)
     settings_ = Options(
         flux_density_min=-0.5, flux_density_max=0.5, lead_time=MILLISECOND, **options)
     planner = Planner(paper_actuator(), settings_)
-    plant = ActuatorSimulation(paper_actuator(), slew_limit=slew)
+    plant = ActuatorSimulation(
+        paper_actuator(), slew_limit=options.get('slew_limit', math.inf),
+        coil_time_constant=options.get('coil_time_constant', 0.0))
     requests = {0: 1.4, 3: 0.9, 7: 1.2, 8: 1.2, 60: 1.3, 63: 'stop'}
     samples = []
     for time in range(0, 160):
