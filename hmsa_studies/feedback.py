@@ -161,8 +161,7 @@ def _moves(commanding: Commander, targets: Sequence[float]) -> Iterator[Expected
 
 
 def trial(
-        scenario: Scenario, strategy: Strategy, error: float, seed: int,
-        targets: Sequence[float] = ()) -> list[ExpectedResidual]:
+        scenario: Scenario, strategy: Strategy, error: float, seed: int) -> list[ExpectedResidual]:
     """
     Run one sequence of moves.
 
@@ -176,8 +175,6 @@ def trial(
         Relative error of the shear modulus.
     seed : int
         Seed of the noise.
-    targets : sequence of float
-        Target stretches; default those of the scenario.
 
     Returns
     -------
@@ -186,10 +183,9 @@ def trial(
         further move.
 
     """
-    targets = targets or scenario.targets
     if strategy.kind == 'learning':
-        return list(_learned(scenario, strategy, error, seed, targets[0]))
-    return list(_moves(commander(scenario, strategy, error, seed), targets))
+        return list(_learned(scenario, strategy, error, seed, scenario.targets[0]))
+    return list(_moves(commander(scenario, strategy, error, seed), scenario.targets))
 
 
 def _learned(

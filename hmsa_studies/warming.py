@@ -65,7 +65,7 @@ def block() -> ActuatorParameters:
     return replace(made, thermal=replace(SILICONE, rise=float(WARMING / level / reached)))
 
 
-def warming(way: str, seed: int = 0) -> list[Left]:
+def warming(way: str) -> list[Left]:
     """
     Run the moves.
 
@@ -73,8 +73,6 @@ def warming(way: str, seed: int = 0) -> list[Left]:
     ----------
     way : str
         What the planner knows, one of `WAYS`.
-    seed : int
-        Seed of the noise, for feedback.
 
     Returns
     -------
@@ -89,7 +87,7 @@ def warming(way: str, seed: int = 0) -> list[Left]:
     feedback = way == 'feedback'
     device = SimulatedDevice(
         [SimulatedJoint(Setup(truth), errors=SensorErrors(_NOISE if feedback else 0.0))],
-        period=round(_PERIOD.get(way, 0.05) * NANOSECONDS), time=NANOSECONDS, seed=seed)
+        period=round(_PERIOD.get(way, 0.05) * NANOSECONDS), time=NANOSECONDS)
     planner = Planner(replace(truth, thermal=known), Options(
         flux_density_min=-0.5, flux_density_max=0.5, lead_time=5_000_000))
     loop = Loop(PlannerGroup({_JOINT: planner}), Settings(

@@ -97,11 +97,9 @@ class BagSummary:
         return sum(counted) if counted else None
 
 
-def summarize(
-        bag: str | os.PathLike[str] | BagReader, *,
-        max_chunk_size: int = limits.CHUNK_SIZE) -> BagSummary:
+def summarize(bag: str | os.PathLike[str] | BagReader) -> BagSummary:
     """Return the summary of a bag or of its reader; raise `BadInputError` if it is no bag."""
-    reader = bag if isinstance(bag, BagReader) else BagReader(bag, max_chunk_size=max_chunk_size)
+    reader = bag if isinstance(bag, BagReader) else BagReader(bag)
     # This comes first because it detects damage.
     counts, unreadable = reader.counts(), reader.unreadable()
     start, end = reader.start_time, reader.end_time
