@@ -5,7 +5,7 @@ The planner publishes one for each setpoint as soon as it is decided, and a newe
 changes; reports and comparisons read them.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 import json
 import math
@@ -26,6 +26,43 @@ _FIGURES = ('offset', 'offset_std', 'vibration', 'vibration_std', 'frequency', '
 _LATEST = 2**62
 # Slowest vibration in rad/s; slower ones would make a window of years.
 _SLOWEST = 1e-6
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f'{text} in an outcome: expected a finite number')
+    return value
+
+
+def _time(value: str | int) -> int:
+    time = int(value)
+    if abs(time) > _LATEST:
+        raise ValueError(f'{time} ns in an outcome: expected a time of a clock')
+    return time
+
+
+def _count(text: str) -> int:
+    count = int(text)
+    if not 0 <= count < 2**31:
+        raise ValueError(f'{count} in an outcome: expected a number of setpoints')
+    return count
+
+
+def _flag(text: str) -> bool:
+    return text == str(True)
+
+
+# Fields of an outcome in a status, under their names, and what reads them; times are in ns.
+_OWN: dict[str, Callable[[str], Any]] = {
+    'asked': str, 'request': str, 'plan': _count, 'through': _count, 'coordinate': str,
+    'corrected': _flag, 'ended': str, 'until': _time, 'decided': _time}
+# Fields of its setpoint by key, and what reads them.
+_ASKED: dict[str, tuple[str, Callable[[str], Any]]] = {
+    'setpoint': ('number', _count), 'setpoints': ('count', _count), 'target': ('target', _finite),
+    'start': ('start', _finite), 'begins': ('begins', _time), 'end': ('end', _time),
+    'held': ('held', _flag), 'omega': ('frequency', _finite),
+    'decay': ('decay', lambda x: max(_finite(x), 0.0)), 'joint': ('joint', str)}
 
 
 @dataclass(frozen=True)
@@ -81,15 +118,10 @@ class Outcome:
         """Return the outcome as the values of a status, by key; unknown values are omitted."""
         asked = self.setpoint
         values: dict[str, object] = {
-            'asked': self.asked, 'request': self.request, 'plan': self.plan,
-            'setpoint': asked.number, 'setpoints': asked.count,
-            'through': max(self.through, asked.number), 'target': asked.target,
-            'start': asked.start, 'coordinate': self.coordinate, 'begins': asked.begins,
-            'end': asked.end, 'held': asked.held, 'moves': json.dumps(self.moves),
-            'arrival': self.arrival, 'corrected': self.corrected, 'ended': self.ended,
-            'until': self.until, 'decided': self.decided, 'omega': asked.frequency,
-            'decay': asked.decay, 'lowest': asked.possible[0], 'highest': asked.possible[1],
-            'joint': asked.joint}
+            **{x: getattr(self, x) for x in _OWN},
+            'through': max(self.through, asked.number), 'moves': json.dumps(self.moves),
+            'arrival': self.arrival, 'lowest': asked.possible[0], 'highest': asked.possible[1],
+            **{x: getattr(asked, name) for x, (name, _) in _ASKED.items()}}
         if self.finding is not None:
             values |= {'verdict': str(self.finding.verdict), 'samples': self.finding.samples}
             values |= {x: y for x in _FIGURES
@@ -120,51 +152,23 @@ class Outcome:
             for begin, arrival in json.loads(values['moves']))
         first = moves[0][1] if moves else None
         last = moves[-1][1] if moves else None
+        asked: dict[str, Any] = {
+            name: read(values[x]) for x, (name, read) in _ASKED.items() if x in values}
         setpoint = RequestedSetpoint(
-            _finite(values['target']), _finite(values['start']), _time(values['begins']), first,
-            _time(values['end']) if 'end' in values else None,
-            _finite(values['omega']), max(_finite(values['decay']), 0.0), values.get('joint', ''),
-            _count(values['setpoint']), _count(values['setpoints']),
-            None if last == first else last,
-            (float(values.get('lowest', '-inf')), float(values.get('highest', 'inf'))),
-            values.get('held') == str(True))
-        if setpoint.frequency < _SLOWEST:
+            **asked, arrival=first, moved=None if last == first else last,
+            possible=(float(values.get('lowest', '-inf')), float(values.get('highest', 'inf'))))
+        if not setpoint.frequency >= _SLOWEST:
             raise ValueError(f'omega is {setpoint.frequency:g}: expected at least {_SLOWEST:g}')
         found = None
         if verdict := values.get('verdict'):
             found = Finding(
                 Code(verdict), message, setpoint, _count(values.get('samples', '0')),
                 **{x: float(values.get(x, 'nan')) for x in _FIGURES})
-        return cls(
-            setpoint, values.get('asked', SETPOINT), values.get('request', ''),
-            _count(values['plan']), joint, values.get('coordinate', 'stretch'),
-            _time(values['decided']), _count(values.get('through', '0')), moves,
-            values.get('corrected') == str(True), values.get('ended', ''),
-            _time(values['until']) if 'until' in values else None, found)
+        own: dict[str, Any] = {x: read(values[x]) for x, read in _OWN.items() if x in values}
+        return cls(**own, setpoint=setpoint, joint=joint, moves=moves, finding=found)
 
 
 def newest(outcomes: Iterable[Outcome]) -> list[Outcome]:
     """Return the last outcome of each setpoint, by begin."""
     found = {x.key: x for x in outcomes}
     return sorted(found.values(), key=lambda x: (x.setpoint.begins, x.plan, x.setpoint.number))
-
-
-def _finite(text: str) -> float:
-    value = float(text)
-    if not math.isfinite(value):
-        raise ValueError(f'{text} in an outcome: expected a finite number')
-    return value
-
-
-def _time(value: str | int) -> int:
-    time = int(value)
-    if abs(time) > _LATEST:
-        raise ValueError(f'{time} ns in an outcome: expected a time of a clock')
-    return time
-
-
-def _count(text: str) -> int:
-    count = int(text)
-    if not 0 <= count < 2**31:
-        raise ValueError(f'{count} in an outcome: expected a number of setpoints')
-    return count
