@@ -16,7 +16,7 @@ from hmsa.errors import BadInputError
 from hmsa.interfaces import topics
 from hmsa.interfaces.parameters import JOINT, LATENESS_LIMIT, ParameterSpec
 from hmsa.model.units import NANOSECONDS
-from hmsa_ros.device.health import judge_commands
+from hmsa_ros.device.interlock import judge_commands
 from hmsa_ros.device.protocol import Change, Kind, Notice, Sample
 from hmsa_ros.device.watchdog import Fallback, SAFE_FLUX
 from hmsa_ros.device.worker import STALL
