@@ -20,12 +20,11 @@ from hmsa.interfaces.topics import FLUX_DENSITY_COMMAND
 from hmsa.model.residual import percent
 from hmsa.report import style
 from hmsa.report.arrivals import Part
-from hmsa.report.bands import draw_bands
 from hmsa.report.charts import commanded, PANELS
 from hmsa.report.curves import decimate, through, TimeCurve
 from hmsa.report.looks import case, CASES, LineStyle, SHAPERS
 from hmsa.report.paper import KINDS, named, Paper
-from hmsa.report.picture import draw
+from hmsa.report.picture import draw, draw_bands
 from hmsa_studies.sweep_pictures import label_of, worded
 
 # What deuteranopia and protanopia leave of linear red, green and blue (Machado and others, IEEE

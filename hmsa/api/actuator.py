@@ -25,8 +25,7 @@ from hmsa.api.arguments import (
     whole,
 )
 from hmsa.api.doubts import unquestioned, warn
-from hmsa.api.facts import facts
-from hmsa.api.mounting import further_facts, with_mount
+from hmsa.api.mounting import facts, further_facts, with_mount
 from hmsa.errors import assume, BadInputError, excerpt, meant, UnusualWarning
 from hmsa.files import write_text, yaml_text
 from hmsa.interfaces.actuator import actuator_from, model_from, parameters_of

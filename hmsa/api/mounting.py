@@ -1,4 +1,8 @@
-"""An actuator with the modes that it has as a continuum: a block free or glued, a beam clamped."""
+"""
+An actuator with the modes that it has as a continuum, and derived quantities of one, as text.
+
+A block is free or glued, a beam clamped.
+"""
 
 from dataclasses import replace
 import math
@@ -10,10 +14,13 @@ from hmsa.errors import BadInputError
 from hmsa.interfaces.actuator import actuator_from, along_elastica, parameters_of
 from hmsa.model.continuum import check_mount, clamped, mounted
 from hmsa.model.equations import critical_zeta, elastic_force, equilibrium_stretch
+from hmsa.model.laws.record import ENDLESS
 from hmsa.model.modes import Modes, MOUNTS
 from hmsa.model.moves import State
 from hmsa.model.parameters import ActuatorParameters
 from hmsa.model.simulation import observed, sampled
+from hmsa.model.units import flux_text
+from hmsa.planning.scales import Scales
 from hmsa.planning.shapers import get_shaper
 from hmsa.planning.shapers.request import MoveRequest
 from hmsa.planning.timeline import JointModel
@@ -171,3 +178,33 @@ def _left(
     times = np.linspace(end, end + _PERIODS * period, _LOOK, dtype=np.float64)
     stretch = observed(sampled(levels, State(rest), times, material), material)[0]
     return 100.0 * float(np.ptp(stretch)) / move
+
+
+def facts(found: Scales, block: ActuatorParameters) -> list[tuple[str, str]]:
+    """Return names and values, with units, of the derived quantities."""
+    beam, words = block.rest == 0.0, block.coordinate.plural
+    return [
+        ('time unit' if beam or block.geometry.inertia != 1.0 else 'time unit L sqrt(rho/G)',
+         _time_text(found.time_unit)),
+        ('natural frequency at rest', f'{found.frequency:.5g} Hz'),
+        ('damping', f'{found.damping:.4g} N s/m, zeta {found.zeta:.4g}'),
+        ('critical damping at rest',
+         f'{found.critical_damping:.4g} N s/m, zeta {found.critical_zeta:.4g}'),
+        *([] if found.stretch_limits in (ENDLESS, (0.0, math.inf))
+          else [(f'limiting {words}', '{:.4f} and {:.4f}'.format(*found.stretch_limits))]),
+        *([] if beam else [('shape c1', f'{found.c1:.4g}')]),
+        *((f'flux density for {stretch:.6g}', flux_text(level, '.4g'))
+          for stretch, level in found.flux_densities),
+        (f'coil holds {words}', '{:.6g} to {:.6g}'.format(*found.held)),
+        ('two-step range from rest', 'none' if found.reached == (block.rest,) * 2
+         else '{:.6g} to {:.6g}'.format(*found.reached)),
+        ('move time from rest', 'no two-step command' if math.isnan(found.duration)
+         else f'{_time_text(found.duration)} to {found.target:.6g}')]
+
+
+def _time_text(seconds: float) -> str:
+    """Return a time in s, ms or us."""
+    for size, unit in ((1.0, 's'), (1e-3, 'ms')):
+        if seconds >= size:
+            return f'{seconds / size:.4g} {unit}'
+    return f'{seconds * 1e6:.4g} us'

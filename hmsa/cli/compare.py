@@ -76,7 +76,7 @@ def _compare_repeats(
         found = {label: statistics([x.evaluation.findings for x in group])
                  for label, group in parts.items()}
         if arguments.picture:
-            from hmsa.report.bands import draw_bands
+            from hmsa.report.picture import draw_bands
             draw_bands(arguments.picture, parts, paper)
     return show(arguments, {
         'runs': list(found), 'setpoints': [

@@ -119,8 +119,7 @@ def run(arguments: argparse.Namespace) -> int:
         if not _known(quantity.key, given):
             given[quantity.key] = default_of(quantity, given)
     from hmsa.api.doubts import doubts as doubts_of
-    from hmsa.api.facts import facts
-    from hmsa.api.mounting import further_facts
+    from hmsa.api.mounting import facts, further_facts
 
     made = _actuator(form, given, arguments.law, arguments.mount)
     found = made.scales

@@ -21,10 +21,10 @@ from hmsa.cli.options import (
     LAW_OPTION,
     MATERIAL,
     of_unit,
+    setpoint,
     show,
     temperature_option,
 )
-from hmsa.cli.setpoints import setpoint
 from hmsa.cli.terminal import progress
 from hmsa.errors import BadInputError
 from hmsa.files import check_targets

@@ -13,8 +13,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from hmsa.cli.options import add_command, JOINTS, NAMESPACE
-from hmsa.cli.setpoints import setpoint_of_joints
+from hmsa.cli.options import add_command, JOINTS, NAMESPACE, setpoint_of_joints
 from hmsa.ending import ENDING
 from hmsa.errors import BadInputError
 

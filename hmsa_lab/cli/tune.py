@@ -15,8 +15,14 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from hmsa.cli.identify import known_of
-from hmsa.cli.options import add_command, argument, assume_example, NAMESPACE, show
-from hmsa.cli.setpoints import setpoint_of_joints
+from hmsa.cli.options import (
+    add_command,
+    argument,
+    assume_example,
+    NAMESPACE,
+    setpoint_of_joints,
+    show,
+)
 from hmsa.cli.terminal import PATIENCE, progress, show_notes
 from hmsa.ending import ENDING
 from hmsa.errors import BadInputError

@@ -17,8 +17,7 @@ from pathlib import Path
 import sys
 from typing import Any, TYPE_CHECKING
 
-from hmsa.cli.options import add_command, assume_example, JOINTS, NAMESPACE
-from hmsa.cli.setpoints import SEQUENCE, sequence_of
+from hmsa.cli.options import add_command, assume_example, JOINTS, NAMESPACE, SEQUENCE, sequence_of
 from hmsa.cli.terminal import PATIENCE, progress, show_notes, with_notes
 from hmsa.ending import ENDING
 from hmsa.errors import BadInputError

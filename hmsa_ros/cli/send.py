@@ -11,8 +11,7 @@ import argparse
 import sys
 from typing import Any, TYPE_CHECKING
 
-from hmsa.cli.options import add_command, JOINTS, NAMESPACE, timeout_of
-from hmsa.cli.setpoints import SEQUENCE, sequence_of
+from hmsa.cli.options import add_command, JOINTS, NAMESPACE, SEQUENCE, sequence_of, timeout_of
 from hmsa.cli.terminal import show_notes
 from hmsa.ending import ENDING
 from hmsa.errors import HmsaError
