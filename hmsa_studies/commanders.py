@@ -10,12 +10,12 @@ from dataclasses import dataclass, field, replace
 
 from hmsa.model.actuators import Setup
 from hmsa.model.parameters import ActuatorParameters, NondimensionalParameters
+from hmsa.model.sensor import SensorErrors
 from hmsa.model.simulation import ActuatorSimulation
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Options, Planner
 from hmsa_lab.adapt.expected_error import caution
-from hmsa_ros.device.sensor import SensorErrors
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.runtime.loop import Loop
 from hmsa_ros.runtime.records import Settings, StretchRequest, TRACKED

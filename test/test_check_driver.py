@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from hmsa.cli import main
+from hmsa.model.sensor import Sample
 from hmsa_lab.bench import bench, conformance
 from hmsa_lab.bench.bench import Bench, PhaseResults
-from hmsa_ros.device.protocol import Sample
 
 # One class for all: a block at a level, whose state survives its process, in a file.
 BENCH = '''

@@ -13,10 +13,10 @@ from hmsa.errors import BadInputError
 from hmsa.interfaces.actuator import enough_samples, too_few_samples
 from hmsa.model.actuators import Setup
 from hmsa.model.parameters import paper_actuator
+from hmsa.model.sensor import Delay, Sample, Sensor, SensorErrors
 from hmsa.model.simulation import ActuatorSimulation
 from hmsa_ros.device.interlock import judge_commands
-from hmsa_ros.device.protocol import Kind, Sample
-from hmsa_ros.device.sensor import Delay, Sensor, SensorErrors
+from hmsa_ros.device.protocol import Kind
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.device.watchdog import Fallback, GuardedJoint
 

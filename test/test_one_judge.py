@@ -15,12 +15,12 @@ from hmsa.interfaces.outcome import newest, Outcome
 from hmsa.judge.records import SensorModel
 from hmsa.model.actuators import Setup
 from hmsa.model.parameters import paper_actuator
+from hmsa.model.sensor import SensorErrors
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Options, Planner
 from hmsa.report.outcome import findings_of
 from hmsa.runs.levels import RecordedLevel
 from hmsa.runs.record import LearntSensor, Run
-from hmsa_ros.device.sensor import SensorErrors
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.runtime.records import (
     Environment,

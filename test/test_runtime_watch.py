@@ -11,10 +11,10 @@ from hmsa.judge import judging, setpoint_samples
 from hmsa.judge.records import RequestedSetpoint, SensorModel, Tolerances
 from hmsa.model.actuators import Setup
 from hmsa.model.parameters import paper_actuator
+from hmsa.model.sensor import SensorErrors
 from hmsa.model.status import Code
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Options, Planner
-from hmsa_ros.device.sensor import SensorErrors
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.runtime.records import Environment, Note, Send, Settings, StatusChanged, Trajectory
 from hmsa_ros.runtime.runtime import Runtime

@@ -11,11 +11,12 @@ import numpy as np
 
 from hmsa.errors import BadInputError, HmsaError
 from hmsa.model.equations import Array
+from hmsa.model.sensor import Sample
 from hmsa.model.units import NANOSECONDS
 from hmsa_ros.device.coil import Coil, HardwareJoint
 from hmsa_ros.device.driven import HardwareDevice
 from hmsa_ros.device.hardware import Calls, load
-from hmsa_ros.device.protocol import Change, Sample
+from hmsa_ros.device.protocol import Change
 from hmsa_ros.device.watchdog import Fallback
 from hmsa_ros.device.worker import HardwareWorker
 

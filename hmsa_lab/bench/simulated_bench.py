@@ -6,8 +6,8 @@ from time import time_ns
 
 from hmsa.model.actuators import Setup
 from hmsa.model.parameters import paper_actuator
+from hmsa.model.sensor import SensorErrors
 from hmsa.model.units import NANOSECONDS
-from hmsa_ros.device.sensor import SensorErrors
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 
 # Sampling period in ns, and number of samples stored for a probe.

@@ -21,6 +21,7 @@ from hmsa.judge.records import Tolerances
 from hmsa.model.actuators import Setup
 from hmsa.model.equations import Array
 from hmsa.model.parameters import ActuatorParameters, paper_actuator
+from hmsa.model.sensor import SensorErrors
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Options, Planner
 from hmsa.report.evaluation import MoveResult
@@ -29,7 +30,6 @@ from hmsa.runs.bags import read_runs
 from hmsa.runs.levels import without_repeats
 from hmsa_ros.clients.experiment import conduct, Experiment
 from hmsa_ros.clients.processes import NodeProcess
-from hmsa_ros.device.sensor import SensorErrors
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.runtime.loop import Loop
 from hmsa_ros.runtime.records import Settings, StretchRequest

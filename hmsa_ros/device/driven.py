@@ -8,9 +8,10 @@ import numpy as np
 
 from hmsa.errors import BadInputError
 from hmsa.model.equations import Array
+from hmsa.model.sensor import Sample
 from hmsa_ros.device.coil import Coil, HardwareJoint
 from hmsa_ros.device.hardware import Calls, HardwareError
-from hmsa_ros.device.protocol import Kind, Sample
+from hmsa_ros.device.protocol import Kind
 from hmsa_ros.device.watchdog import Device
 from hmsa_ros.timekeeping import clock_set_words
 

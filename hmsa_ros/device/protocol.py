@@ -3,8 +3,6 @@
 from enum import Enum
 from typing import NamedTuple
 
-from hmsa.model.equations import Array
-
 
 class StateLostError(Exception):
     """
@@ -20,15 +18,6 @@ class Change(NamedTuple):
     joint: int
     stamp: int
     level: float
-
-
-class Sample(NamedTuple):
-    """Sample of all joints: time in ns, stretch, rate in 1/s and flux density in T."""
-
-    time: int
-    stretch: Array
-    rate: Array
-    flux_density: Array
 
 
 class Kind(Enum):

@@ -5,11 +5,11 @@ from dataclasses import dataclass, field
 
 from hmsa.model.actuators import Actuators, Setup
 from hmsa.model.equations import Array
+from hmsa.model.sensor import Delay, Sample, Sensor, SensorErrors
 from hmsa.model.simulation import too_large
 from hmsa.model.thermal import checked_temperature, HOTTEST
 from hmsa.model.units import NANOSECONDS
-from hmsa_ros.device.protocol import Change, Kind, Sample
-from hmsa_ros.device.sensor import Delay, Sensor, SensorErrors
+from hmsa_ros.device.protocol import Change, Kind
 from hmsa_ros.device.watchdog import Device, Fallback, GuardedJoint
 from hmsa_ros.timekeeping import clock_set_words
 

@@ -8,8 +8,9 @@ import math
 from typing import TypeVar
 
 from hmsa.errors import BadInputError
+from hmsa.model.sensor import Sample
 from hmsa.model.units import NANOSECONDS
-from hmsa_ros.device.protocol import Change, Kind, Notice, Sample
+from hmsa_ros.device.protocol import Change, Kind, Notice
 
 T = TypeVar('T')
 

@@ -17,8 +17,8 @@ from hmsa.interfaces import topics
 from hmsa.interfaces.actuator import planned_from, too_few_samples
 from hmsa.interfaces.parameters import ParameterSpec
 from hmsa.model.actuators import Setup, unheld
+from hmsa.model.sensor import SensorErrors
 from hmsa.model.units import NANOSECONDS
-from hmsa_ros.device.sensor import SensorErrors
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.nodes import conversions, ros_entities
 from hmsa_ros.nodes.device_node import COMMON, DeviceJoint, DeviceNode, FALLBACK, fallback_from

@@ -4,14 +4,23 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 import math
-from typing import Generic, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
 from hmsa.errors import BadInputError
-from hmsa_ros.device.protocol import Sample
+from hmsa.model.equations import Array
 
 T = TypeVar('T')
+
+
+class Sample(NamedTuple):
+    """Sample of all joints: time in ns, stretch, rate in 1/s and flux density in T."""
+
+    time: int
+    stretch: Array
+    rate: Array
+    flux_density: Array
 
 
 class Delay(Generic[T]):
