@@ -15,6 +15,7 @@ import threading
 from typing import Any, TypeVar
 
 from hmsa.errors import BadInputError, HmsaError
+from hmsa.planning.two_step import available_cores
 
 Result = TypeVar('Result')
 #: Computes delayed functions, calls a function with the key of each that is done, and returns the
@@ -107,8 +108,8 @@ def cluster(address: str, workers: int | None = None) -> Iterator[Compute]:
             stack.enter_context(config.set(_QUIET))
             with _without_signals():
                 target = stack.enter_context(LocalCluster(
-                    n_workers=workers or cores(), threads_per_worker=1, dashboard_address=None,
-                    silence_logs=logging.CRITICAL))
+                    n_workers=workers or available_cores(), threads_per_worker=1,
+                    dashboard_address=None, silence_logs=logging.CRITICAL))
         else:
             target = None if address.endswith('.json') else address
         try:
@@ -166,13 +167,6 @@ def in_order(
             'a worker died: expected enough memory for all of them; take fewer (--workers)'
         ) from error
     yield from found
-
-
-def cores() -> int:
-    """Return the number of cores that this process may use."""
-    if hasattr(os, 'sched_getaffinity'):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _locally(

@@ -38,11 +38,12 @@ def asked(arguments: argparse.Namespace) -> list[str]:
 
 def workers_of(arguments: argparse.Namespace, count: int) -> 'tuple[Start, int]':
     """Return the workers, by default as many as given, and the number of cores."""
-    from hmsa_studies.schedulers import cluster, cores, local
+    from hmsa.planning.two_step import available_cores
+    from hmsa_studies.schedulers import cluster, local
 
     if arguments.dask is not None:
         return (partial(cluster, arguments.dask, arguments.workers),
-                arguments.workers or (cores() if arguments.dask == 'local' else 1))
+                arguments.workers or (available_cores() if arguments.dask == 'local' else 1))
     return local(arguments.workers or count), arguments.workers or count
 
 

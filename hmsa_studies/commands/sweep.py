@@ -259,13 +259,13 @@ def _plan_at_once(sweep: 'Sweep', out: Path | None, picture: _SweepPicture) -> i
 def _plan_in_chunks(
         sweep: 'Sweep', arguments: argparse.Namespace, picture: _SweepPicture) -> int:
     from hmsa.files import require_arrow
-    from hmsa_studies.schedulers import cores
+    from hmsa.planning.two_step import available_cores
     from hmsa_studies.study_folder import StudyFolder
 
     require_arrow()
     table, place = _places(arguments.out)
     small = sweep.size <= _SMALL * sweep.rate
-    start, known = chunked.workers_of(arguments, 1 if small else cores())
+    start, known = chunked.workers_of(arguments, 1 if small else available_cores())
     folder = StudyFolder(sweep, place)
     _estimate(sweep, folder, known, chunked.parse_shard(arguments.shard))
 
