@@ -101,43 +101,43 @@ def check_target(stretch: float, rest: float) -> None:
 
 
 def draft_sequence(
-        outset: PlanStart, points: Sequence[tuple[float, int]], base: int,
+        start: PlanStart, points: Sequence[tuple[float, int]], base: int,
         now: int) -> Draft | None:
     """
     Draft checked points (stretch, end in ns) from a start in ns; None if they change nothing.
 
     Raise `RefusedError` if the sequence cannot be carried out.
     """
-    begin = outset.begin
+    begin = start.begin
     if points[0][1] == 0 and len(points) > 1 and base == begin:
         # A first point at time 0 that repeats the planned position is ignored.
-        here = outset.plan.level(begin).at(begin).stretch
+        here = start.plan.level(begin).at(begin).stretch
         if abs(points[0][0] - here) > 1e-6:
             raise RefusedError(
                 Code.SPELL_TOO_SHORT,
-                f'the first point asks for {outset.model.units.coordinate} {points[0][0]:g} at '
+                f'the first point asks for {start.model.units.coordinate} {points[0][0]:g} at '
                 f'time_from_start 0, the actuator is at {here:.6g}: expected enough time for the '
                 'move')
     if base + points[-1][1] <= begin:
-        raise _over(points, base, now, outset.model.units.coordinate)
+        raise _over(points, base, now, start.model.units.coordinate)
     setpoints = []
     left = begin
     for number, (stretch, time) in enumerate(points):
         if base + time > begin:
-            end = outset.model.on_grid(base + time)
+            end = start.model.on_grid(base + time)
             if end == left:
                 raise RefusedError(
                     Code.SPELL_TOO_SHORT,
-                    f'{outset.model.units.coordinate} {stretch:g} begins and ends within one '
-                    f'command period of {outset.model.options.period / NANOSECONDS:g} s: expected '
+                    f'{start.model.units.coordinate} {stretch:g} begins and ends within one '
+                    f'command period of {start.model.options.period / NANOSECONDS:g} s: expected '
                     'a longer duration')
-            setpoints.append(Setpoint(stretch, outset.model.time(end - left)))
+            setpoints.append(Setpoint(stretch, start.model.time(end - left)))
             left = end
         if number % _CHECKED == _CHECKED - 1:
-            outset.check()
-    if len(setpoints) == 1 and outset.plan.ends_at(setpoints[0].stretch, begin):
+            start.check()
+    if len(setpoints) == 1 and start.plan.ends_at(setpoints[0].stretch, begin):
         return None
-    return draft_moves(outset, setpoints)
+    return draft_moves(start, setpoints)
 
 
 def check_path(points: Sequence[tuple[PathPoint, int]], rest: float) -> None:
@@ -160,7 +160,7 @@ def check_path(points: Sequence[tuple[PathPoint, int]], rest: float) -> None:
 
 
 def draft_path(
-        outset: PlanStart, points: Sequence[tuple[PathPoint, int]], base: int,
+        start: PlanStart, points: Sequence[tuple[PathPoint, int]], base: int,
         now: int) -> Draft:
     """
     Draft a checked path from a start in ns, or join it if it has begun.
@@ -168,11 +168,11 @@ def draft_path(
     An actuator that is not on the path moves to its first point, or to the first point that is at
     least a natural period ahead. Raise `RefusedError` if the path cannot be followed.
     """
-    model, state, unit = outset.model, outset.state, outset.model.units.time
+    model, state, unit = start.model, start.state, start.model.units.time
     ended, last = points[-1]
-    if base + last <= outset.begin:
+    if base + last <= start.begin:
         raise _over([(ended[0], last)], base, now, model.units.coordinate)
-    times = np.array([model.time(base + x - outset.begin) for _, x in points])
+    times = np.array([model.time(base + x - start.begin) for _, x in points])
     rows = np.array([x for x, _ in points]).T * np.array([[1.0], [unit], [unit * unit]])
     given = None if np.isnan(rows[2, 0]) else rows[2]
     path = None
@@ -191,48 +191,48 @@ def draft_path(
         times = np.append(0.0, times[ahead])
         rows = np.column_stack([here, rows[:, ahead]])
         path = Path.through(times, rows[0], rows[1], None if given is None else rows[2])
-    outset.check()
+    start.check()
     return _along(
-        outset, path, float(rows[0, -1]), model.options.path_tolerance,
+        start, path, float(rows[0, -1]), model.options.path_tolerance,
         path=path.scaled(1.0 / unit))
 
 
-def draft_path_anew(outset: PlanStart) -> Draft:
+def draft_path_anew(start: PlanStart) -> Draft:
     """
     Draft the rest of the running path again, with a return to it within half a natural period.
 
     Raise `RefusedError` if the path cannot be followed.
     """
-    model, state, place = outset.model, outset.state, outset.plan.under_way(outset.begin)
-    segment = outset.plan.segments[place]
+    model, state, place = start.model, start.state, start.plan.under_way(start.begin)
+    segment = start.plan.segments[place]
     if segment.path is None:
         raise ValueError('the setpoint under way is no path')
-    left = segment.path.scaled(model.units.time).since(model.time(outset.begin - segment.since))
+    left = segment.path.scaled(model.units.time).since(model.time(start.begin - segment.since))
     span = min(_BACK * 2.0 * math.pi / model.frequency(segment.stretch), float(left.breaks[-1]))
     return replace((_along(
-        outset, left.joined(state.stretch, state.rate, span), segment.stretch,
+        start, left.joined(state.stretch, state.rate, span), segment.stretch,
         max(model.options.path_tolerance, _ANEW), since=segment.since, path=segment.path)),
         resumed=place)
 
 
 def _along(
-        outset: PlanStart, wanted: Path, target: float, tolerance: float,
+        start: PlanStart, wanted: Path, target: float, tolerance: float,
         **known: Any) -> Draft:
     """Follow a path to rest at a target; further fields of its segment are given."""
     move = along(
-        replace(_frame(outset.model, outset.state), target=target), wanted, tolerance,
-        outset.check)
+        replace(_frame(start.model, start.state), target=target), wanted, tolerance,
+        start.check)
     draft = draft_moves(
-        outset, [Setpoint(target, math.inf)], first=lambda request: move)
+        start, [Setpoint(target, math.inf)], first=lambda request: move)
     return replace(draft, segments=(replace(draft.segments[0], **known),))
 
 
-def draft_stop(outset: PlanStart) -> Draft:
+def draft_stop(start: PlanStart) -> Draft:
     """Draft a stop: rest as near as the flux density limits allow."""
     # A two-step command with the hardest braking load as beta_p: that load up to the first turning
     # point, then the load that holds this point. If a single brake is impossible (on a command
     # grid, with ramps or at a limit), plan a move to a stretch near by.
-    model, state = outset.model, outset.state
+    model, state = start.model, start.state
     found = brake(model, state)
     # A coil that must not step brakes as the shaper smooth does, from the turning point on, and a
     # block with modes as modal does.
@@ -246,19 +246,19 @@ def draft_stop(outset: PlanStart) -> Draft:
             + [Level(found.duration, model.holding(found.stretch))]),
             found.duration, 'stopped')
         end = State(found.stretch, 0.0, move.levels[-1].load)
-        levels, placed = _placed(model, outset.begin, outset.check, Segment(
+        levels, placed = _placed(model, start.begin, start.check, Segment(
             Setpoint(found.stretch, math.inf), 0.0, state, end, move, end.load))
-        return Draft(outset.begin, tuple(levels), (placed,))
+        return Draft(start.begin, tuple(levels), (placed,))
     ways = [(0.0, own)] * bool(own) + [(x, 'two_step') for x in _BRAKE_SHARES]
     for share, shaper in ways:
         stretch = holdable(model, brake(model, state, share).stretch)
         try:
-            return draft_moves(outset, [Setpoint(stretch, math.inf)], shaper)
+            return draft_moves(start, [Setpoint(stretch, math.inf)], shaper)
         except BadInputError:
-            outset.check()
+            start.check()
     # No command stops the motion at once: let it settle.
     return draft_moves(
-        outset, [Setpoint(holdable(model, state.stretch), math.inf)], 'step')
+        start, [Setpoint(holdable(model, state.stretch), math.inf)], 'step')
 
 
 def _settled(model: JointModel, state: State) -> bool:
@@ -274,7 +274,7 @@ def later_starts(model: JointModel, stretch: float, begin: int) -> Iterator[int]
         yield model.on_grid(begin + model.ns(share * period))
 
 
-def draft_resumption(outset: PlanStart, arrival: int | None = None) -> Draft | None:
+def draft_resumption(start: PlanStart, arrival: int | None = None) -> Draft | None:
     """
     Draft the rest of the running plan again, up to where both agree; None if nothing is left.
 
@@ -283,21 +283,21 @@ def draft_resumption(outset: PlanStart, arrival: int | None = None) -> Draft | N
     """
     # Setpoints end when planned before; one without time left is skipped. Where the new plan meets
     # the running one, the running one continues.
-    planned = outset.plan.segments
-    begun = max(outset.plan.under_way(outset.begin), 0)
+    planned = start.plan.segments
+    begun = max(start.plan.under_way(start.begin), 0)
     first = None if arrival is None else partial(
-        through, duration=outset.model.time(arrival - outset.begin))
+        through, duration=start.model.time(arrival - start.begin))
     refusal: RefusedError | None = None
     for index in range(begun, len(planned)):
         # A skipped setpoint leaves its time to the next one, to which the move starts at once.
         try:
             draft = draft_moves(
-                outset, _left(outset, index), first=first, index=index)
+                start, _left(start, index), first=first, index=index)
         except RefusedError as error:
             refusal = refusal or error
             if error.code is not Code.SPELL_TOO_SHORT or arrival is not None:
                 break
-            outset.check()
+            start.check()
             continue
         anew = replace(
             draft.segments[0], since=min(planned[index].since, draft.segments[0].since))
@@ -308,91 +308,91 @@ def draft_resumption(outset: PlanStart, arrival: int | None = None) -> Draft | N
     return None
 
 
-def draft_later(outset: PlanStart, index: int) -> Draft:
+def draft_later(start: PlanStart, index: int) -> Draft:
     """
     Draft the setpoints of the running plan from an index on again, from the start of the first.
 
     Raise `RefusedError` if they cannot be carried out.
     """
-    return replace(draft_moves(outset, _left(outset, index), index=index), resumed=index)
+    return replace(draft_moves(start, _left(start, index), index=index), resumed=index)
 
 
-def _left(outset: PlanStart, index: int) -> Iterator[Setpoint]:
+def _left(start: PlanStart, index: int) -> Iterator[Setpoint]:
     """Yield the setpoints of the running plan from an index on, with their remaining durations."""
-    planned = outset.plan.segments
-    left = outset.begin
+    planned = start.plan.segments
+    left = start.begin
     for place in range(index, len(planned) - 1):
         end = planned[place + 1].since
-        yield Setpoint(planned[place].stretch, outset.model.time(end - left))
+        yield Setpoint(planned[place].stretch, start.model.time(end - left))
         left = end
     yield Setpoint(planned[-1].stretch, math.inf)
 
 
-def _meeting(outset: PlanStart, state: State, following: int) -> int | None:
+def _meeting(start: PlanStart, state: State, following: int) -> int | None:
     """Return the index of the level at which the running plan continues a state, else None."""
-    planned = outset.plan.segments[following]
-    place = outset.plan.place(planned.begin)
-    level = outset.plan.levels[place]
-    if (level.stamp != planned.begin or level.model is not outset.model
-            or outset.stale is not None and place < outset.stale):
+    planned = start.plan.segments[following]
+    place = start.plan.place(planned.begin)
+    level = start.plan.levels[place]
+    if (level.stamp != planned.begin or level.model is not start.model
+            or start.stale is not None and place < start.stale):
         return None
     here = PlannedLevel(level.stamp, level.flux_density, state, level.model)
     return place if agree(here, level) else None
 
 
 def draft_moves(
-        outset: PlanStart, setpoints: Iterable[Setpoint], shaper: str = '',
+        start: PlanStart, setpoints: Iterable[Setpoint], shaper: str = '',
         first: Shaper | None = None, index: int | None = None) -> Draft:
     """
     Draft setpoints on the timeline; the default shaper is that of the options.
 
     With ``index``, they are those of the running plan from there on, which continues once met.
     """
-    if outset.warmth is not None:
+    if start.warmth is not None:
         return _warming(
-            outset, outset.warmth, setpoints, SHAPERS[shaper or outset.model.options.shaper],
+            start, start.warmth, setpoints, SHAPERS[shaper or start.model.options.shaper],
             first)
-    model, planned = outset.model, outset.plan.segments
+    model, planned = start.model, start.plan.segments
     levels: list[PlannedLevel] = []
     placed: list[PlannedSegment] = []
     for segment in segments(
-            _frame(model, outset.state), setpoints, SHAPERS[shaper or model.options.shaper],
+            _frame(model, start.state), setpoints, SHAPERS[shaper or model.options.shaper],
             model.options.short_spell, first=first):
         if placed:
-            outset.check()
-        more, one = _placed(model, outset.begin, outset.check, segment)
+            start.check()
+        more, one = _placed(model, start.begin, start.check, segment)
         levels += more
         placed.append(one)
         following = len(planned) if index is None else index + len(placed)
-        place = _meeting(outset, segment.end, following) if following < len(planned) else None
+        place = _meeting(start, segment.end, following) if following < len(planned) else None
         if place is not None:
-            levels += outset.plan.levels[place:]
+            levels += start.plan.levels[place:]
             placed += planned[following:]
             break
-    return Draft(outset.begin, tuple(levels), tuple(placed))
+    return Draft(start.begin, tuple(levels), tuple(placed))
 
 
-def draft_warmed(outset: PlanStart, index: int, held: PlannedSegment | None = None) -> Draft:
+def draft_warmed(start: PlanStart, index: int, held: PlannedSegment | None = None) -> Draft:
     """
     Draft the setpoints of the running plan from an index on again, for a temperature.
 
     The first may be ``held``: it stays, and only the levels that hold it are new. Raise
     `RefusedError` if the others cannot be carried out.
     """
-    if outset.warmth is None:
+    if start.warmth is None:
         raise ValueError('the temperature changes nothing')
     return replace(_warming(
-        outset, outset.warmth, _left(outset, index), SHAPERS[outset.model.options.shaper],
+        start, start.warmth, _left(start, index), SHAPERS[start.model.options.shaper],
         held=held), resumed=index)
 
 
 def _warming(
-        outset: PlanStart, warmth: Warmth, setpoints: Iterable[Setpoint], shaper: Shaper,
+        start: PlanStart, warmth: Warmth, setpoints: Iterable[Setpoint], shaper: Shaper,
         first: Shaper | None = None, held: PlannedSegment | None = None) -> Draft:
     """Draft setpoints, each for the temperature foreseen at its begin, with levels that follow."""
-    # Times count from the outset in its units, so that rounding does not add up.
-    model, begin, time = outset.model, outset.begin, 0.0
-    state, now = outset.state, warmth
+    # Times count from the start in its units, so that rounding does not add up.
+    model, begin, time = start.model, start.begin, 0.0
+    state, now = start.state, warmth
     levels: list[PlannedLevel] = []
     placed: list[PlannedSegment] = []
     upcoming = iter(setpoints)
@@ -400,9 +400,9 @@ def _warming(
     while setpoint is not None:
         following = next(upcoming, None)
         time += setpoint.span
-        end = math.inf if math.isinf(time) else outset.begin + outset.model.ns(time)
+        end = math.inf if math.isinf(time) else start.begin + start.model.ns(time)
         if placed:
-            outset.check()
+            start.check()
             now = now.along(levels[-1:], begin)
             before, model = model, now.model(model)
             state = model.held(
@@ -415,7 +415,7 @@ def _warming(
                 _frame(model, state), [Setpoint(setpoint.stretch, span)] + (
                     [] if following is None else [Setpoint(setpoint.stretch, math.inf)]),
                 shaper, model.options.short_spell, first=None if placed else first))
-            more, one = _placed(model, begin, outset.check, segment)
+            more, one = _placed(model, begin, start.check, segment)
             state = segment.end
         now = now.along([levels[-1], *more] if levels else more, more[-1].stamp)
         if one.arrival is not None and not model.material.creeps:
@@ -428,11 +428,11 @@ def _warming(
                     more[-1].flux_density)
                 more.append(_held(model, now.time or 0, one.stretch, state))
                 if number % _CHECKED == _CHECKED - 1:
-                    outset.check()
+                    start.check()
         levels += more
         placed.append(one)
         begin, setpoint = int(end) if following is not None else begin, following
-    return Draft(outset.begin, tuple(levels), tuple(placed))
+    return Draft(start.begin, tuple(levels), tuple(placed))
 
 
 def _held(model: JointModel, time: int, stretch: float, state: State) -> PlannedLevel:

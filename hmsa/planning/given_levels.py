@@ -44,17 +44,17 @@ def check_levels(points: Sequence[tuple[float, int]], model: JointModel) -> None
     check_times(points, 'level')
 
 
-def draft_levels(outset: PlanStart, points: Sequence[tuple[float, int]]) -> Draft:
+def draft_levels(start: PlanStart, points: Sequence[tuple[float, int]]) -> Draft:
     """
     Draft checked levels (T, ns); their one setpoint is the equilibrium stretch of the last one.
 
     If the motion has not ended with the last level, a shaped move to that stretch replaces it.
     Raise `RefusedError` if the motion exceeds the limits of the block or has no way to rest.
     """
-    model, state = outset.model, outset.state
+    model, state = start.model, start.state
     levels: list[PlannedLevel] = []
     for number, (flux_density, time) in enumerate(points):
-        stamp = model.on_grid(outset.begin + time - points[0][1])
+        stamp = model.on_grid(start.begin + time - points[0][1])
         if levels:
             before = levels[-1]
             if stamp <= before.stamp:
@@ -66,7 +66,7 @@ def draft_levels(outset: PlanStart, points: Sequence[tuple[float, int]]) -> Draf
             state = model.follow(
                 state, before.load, model.time(stamp - before.stamp))
         levels.append(PlannedLevel(stamp, flux_density, state, model))
-        outset.check()
+        start.check()
     last = levels[-1]
     _check_motion(len(points) - 1, last, None)
     rest = float(equilibrium_stretch(last.load, model.material))
@@ -79,7 +79,7 @@ def draft_levels(outset: PlanStart, points: Sequence[tuple[float, int]]) -> Draf
     if moves > _REST:
         try:
             end = draft_moves(
-                replace(outset, begin=last.stamp, state=state), [Setpoint(rest, math.inf)],
+                replace(start, begin=last.stamp, state=state), [Setpoint(rest, math.inf)],
                 'two_step')
         except RefusedError as error:
             raise RefusedError(
@@ -88,8 +88,8 @@ def draft_levels(outset: PlanStart, points: Sequence[tuple[float, int]]) -> Draf
                 'writes them') from error
         levels[-1:] = end.levels
         arrival = end.segments[0].arrival
-    return Draft(outset.begin, tuple(levels), (PlannedSegment(
-        rest, outset.begin, arrival, Code.LEVELS, '', outset.begin),))
+    return Draft(start.begin, tuple(levels), (PlannedSegment(
+        rest, start.begin, arrival, Code.LEVELS, '', start.begin),))
 
 
 def _period(model: JointModel, stretch: float) -> float:

@@ -146,10 +146,10 @@ class Planner(RunningPlan):
         if held is not None and held.arrival is not None and held.arrival <= begin and (
                 held.path is None and held.code is not Code.LEVELS
                 and not self.model.material.creeps):
-            return drafting.draft_warmed(self._outset(begin), place, held)
+            return drafting.draft_warmed(self._plan_start(begin), place, held)
         if place + 1 >= len(plan.segments):
             return None
-        return drafting.draft_warmed(self._outset(plan.segments[place + 1].since), place + 1)
+        return drafting.draft_warmed(self._plan_start(plan.segments[place + 1].since), place + 1)
 
     def restart(self) -> None:
         """Drop all plans and return to the initial state at rest, as the clock has restarted."""
@@ -196,8 +196,8 @@ class Planner(RunningPlan):
         request changes nothing. Raise `RefusedError` if it cannot be carried out.
         """
         drafting.check_points(points, self.model.rest, self.check)
-        base, outset = self._begin(stamp, now)
-        return drafting.draft_sequence(outset, points, base, now)
+        base, start = self._begin(stamp, now)
+        return drafting.draft_sequence(start, points, base, now)
 
     def draft_levels(
             self, points: Sequence[tuple[float, int]], stamp: int | None,
@@ -215,7 +215,7 @@ class Planner(RunningPlan):
                 Code.IN_THE_PAST,
                 f'the timestamp of the first level was {(now - begin) / NANOSECONDS:.3f} s ago: '
                 'expected levels more than lead_time ahead')
-        return draft_levels(self._outset(begin), points)
+        return draft_levels(self._plan_start(begin), points)
 
     def draft_path(
             self, points: Sequence[tuple[PathPoint, int]], stamp: int | None,
@@ -227,8 +227,8 @@ class Planner(RunningPlan):
         path, it follows as near as they allow, and the draft has a warning.
         """
         drafting.check_path(points, self.model.rest)
-        base, outset = self._begin(stamp, now)
-        return drafting.draft_path(outset, points, base, now)
+        base, start = self._begin(stamp, now)
+        return drafting.draft_path(start, points, base, now)
 
     def draft_setpoint(self, stretch: float, now: int) -> Draft | None:
         """Draft a move to one stretch; None if it changes nothing."""
@@ -236,36 +236,36 @@ class Planner(RunningPlan):
         begin = self.soonest(now)
         if self.plan.ends_at(stretch, begin):
             return None
-        return drafting.draft_moves(self._outset(begin), [Setpoint(stretch, math.inf)])
+        return drafting.draft_moves(self._plan_start(begin), [Setpoint(stretch, math.inf)])
 
     def draft_stop(self, now: int) -> Draft:
         """Draft a stop."""
-        return drafting.draft_stop(self._outset(self.soonest(now)))
+        return drafting.draft_stop(self._plan_start(self.soonest(now)))
 
     def draft_resumption(self, now: int, arrival: int | None = None) -> Draft | None:
         """Draft the rest of the plan again from the present motion, to arrive in time if given."""
         # None if nothing is left. Start at the earliest time that a command can reach or, if no
         # plan is possible from the motion then, a fraction of a period later.
         begin, *more = self.resumptions(now)
-        outset = self._outset(begin)
+        start = self._plan_start(begin)
         if arrival is not None:
-            return drafting.draft_resumption(outset, arrival)
+            return drafting.draft_resumption(start, arrival)
         for later in (begin, *more):
             try:
-                return drafting.draft_resumption(self._outset(later))
+                return drafting.draft_resumption(self._plan_start(later))
             except RefusedError:
                 # Another phase of the motion may allow it.
                 self.check()
-        return drafting.draft_resumption(outset)
+        return drafting.draft_resumption(start)
 
     def draft_later(self, place: int) -> Draft:
         """Draft the setpoints of the plan from an index on again; those before it stay."""
-        return drafting.draft_later(self._outset(self.plan.segments[place].since), place)
+        return drafting.draft_later(self._plan_start(self.plan.segments[place].since), place)
 
     def draft_path_anew(
             self, begin: int, model: JointModel, believed: Believed | None) -> Draft:
         """Draft the rest of the running path again with a model, from an estimated state."""
-        return drafting.draft_path_anew(self._outset(begin, model, believed))
+        return drafting.draft_path_anew(self._plan_start(begin, model, believed))
 
     def draft_trim(self, now: int, flux_density: float) -> Draft:
         """Draft a corrected level in T that holds the current setpoint, from rest."""
@@ -287,7 +287,7 @@ class Planner(RunningPlan):
         if self.plan.segments:
             begin = max(begin, self.plan.segments[0].since)
         return tuple(dict.fromkeys(drafting.later_starts(
-            self.model, self._outset(begin).state.stretch, begin)))
+            self.model, self._plan_start(begin).state.stretch, begin)))
 
     def start(self, stamp: int | None, now: int) -> int:
         """Return the earliest start in ns of a request for a timestamp; None for now."""
@@ -295,11 +295,11 @@ class Planner(RunningPlan):
         return soonest if stamp is None else self.model.on_grid(max(stamp, soonest))
 
     def _begin(self, stamp: int | None, now: int) -> tuple[int, PlanStart]:
-        """Return the start of a request in ns, and the earliest outset for it."""
+        """Return the start of a request in ns, and the earliest start for it."""
         begin = self.start(stamp, now)
-        return begin if stamp is None else stamp, self._outset(begin)
+        return begin if stamp is None else stamp, self._plan_start(begin)
 
-    def _outset(
+    def _plan_start(
             self, begin: int, model: JointModel | None = None,
             believed: Believed | None = None) -> PlanStart:
         """Return the start of a draft; ``believed`` is given together with another model."""
