@@ -50,7 +50,7 @@ ERRORS = ((0.0,), (-0.1, 0.1), (-0.2, 0.2))
 _WORSE = 1.2
 #: Arguments of `trial`.
 Task = tuple[Scenario, Strategy, float, int]
-# Fields of `Left`.
+# Fields of `ExpectedResidual`.
 _LEFT = ('vibration', 'offset', 'motion')
 
 

@@ -8,7 +8,7 @@ from rclpy.exceptions import InvalidHandle
 from rclpy.serialization import serialize_message
 from std_msgs.msg import Float64, UInt8MultiArray
 
-from hmsa_ros.nodes.capture import Outlet
+from hmsa_ros.nodes.capture import FastPublisher
 
 _LARGE = 30_000_000
 _TIMES = 50
@@ -17,7 +17,7 @@ _TIMES = 50
 @pytest.mark.ros
 def test_what_is_published_arrives_and_other_threads_run_meanwhile(ros):
     received = ros.collect(Float64, 'small')
-    small = Outlet(ros.publisher(Float64, 'small'))
+    small = FastPublisher(ros.publisher(Float64, 'small'))
     small.publish(Float64(data=1.5))
     small.publish(serialize_message(Float64(data=2.5)))
     ros.spin_until(lambda: len(received) == 2, 'both messages')
@@ -25,7 +25,7 @@ def test_what_is_published_arrives_and_other_threads_run_meanwhile(ros):
 
     ticks, ended = count(), Event()
     ros.node.create_subscription(UInt8MultiArray, 'large', lambda _: None, 1)
-    large = Outlet(ros.publisher(UInt8MultiArray, 'large', 1))
+    large = FastPublisher(ros.publisher(UInt8MultiArray, 'large', 1))
     message = serialize_message(UInt8MultiArray(data=bytes(_LARGE)))
 
     def run():
@@ -48,7 +48,7 @@ def test_what_is_published_arrives_and_other_threads_run_meanwhile(ros):
 @pytest.mark.ros
 def test_a_publisher_that_is_gone_is_told(ros):
     publisher = ros.node.create_publisher(Float64, 'gone', 1)
-    outlet = Outlet(publisher)
+    fast = FastPublisher(publisher)
     ros.node.destroy_publisher(publisher)
     with pytest.raises(InvalidHandle):
-        outlet.publish(Float64())
+        fast.publish(Float64())

@@ -25,7 +25,7 @@ from hmsa_lab.watch.scene import JointView, PeakHistory, Report, Scene
 from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.capture import decode, RawSubscription, Taken
 from hmsa_ros.nodes.conversions import from_time
-from hmsa_ros.nodes.duplicate_nodes import Presence
+from hmsa_ros.nodes.duplicate_nodes import DuplicateNodes
 from hmsa_ros.nodes.ros_entities import interface_class
 from hmsa_ros.nodes.temporary_node import leave, visit
 
@@ -102,7 +102,7 @@ class Listener:
         self._begin = self._looked = monotonic()
         self._graph_at = -math.inf
         self._senders = {'samples': 0, 'planner': 0}
-        self._presence, self._crowd = Presence(self._node), list[str]()
+        self._duplicates, self._crowd = DuplicateNodes(self._node), list[str]()
         self._stamp: int | None = None
         self._arrived = -math.inf
         self._rate = math.nan
@@ -114,7 +114,7 @@ class Listener:
     def __exit__(self, *_: object) -> None:
         for source in self._sources:
             source.subscription.destroy()
-        self._presence.close()
+        self._duplicates.close()
         leave(self._node)
 
     def _subscribe(self, topic: topics.Topic, qos: topics.Quality | None = None) -> _Source:
@@ -154,10 +154,10 @@ class Listener:
 
     def _look_at_graph(self) -> None:
         node = self._node
-        self._presence.look()
+        self._duplicates.look()
         self._crowd = [x for x in (
-            self._presence.planners(topics.PLANNER),
-            self._presence.devices(self._planned_joints or tuple(self._joints))) if x]
+            self._duplicates.planners(topics.PLANNER),
+            self._duplicates.devices(self._planned_joints or tuple(self._joints))) if x]
         self._senders = {
             'samples': node.count_publishers(self._samples.topic),
             'planner': node.count_publishers(self._status.topic)}

@@ -25,7 +25,7 @@ from hmsa_ros.clients.link import Link, SILENCE
 from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.capture import decode, RawSubscription
 from hmsa_ros.nodes.conversions import from_time, to_trajectory
-from hmsa_ros.nodes.duplicate_nodes import LATELY_SECONDS, Presence
+from hmsa_ros.nodes.duplicate_nodes import DuplicateNodes, LATELY_SECONDS
 from hmsa_ros.nodes.ros_entities import publishers_of, recorders, subscribers_of
 from hmsa_ros.nodes.service_call import ServiceCall
 from hmsa_ros.nodes.temporary_node import SLICE_SECONDS
@@ -146,20 +146,21 @@ class PlannerClient(Link):
 
         """
         self.pass_time(self._begin + _DISCOVERY_SECONDS - monotonic())
-        presence = Presence(self.node)
+        duplicates = DuplicateNodes(self.node)
         try:
             end = monotonic() + (_FORGOTTEN_SECONDS if own else LATELY_SECONDS)
             # Killed nodes are still discovered, but inactive.
-            while presence.crowded(self._joints, topics.PLANNER) and monotonic() < end:
+            while duplicates.crowded(self._joints, topics.PLANNER) and monotonic() < end:
                 self.say('waiting to see whether a second planner, plant or driver has ended')
-                presence.look()
-                if found := presence.planners(topics.PLANNER) or presence.devices(self._joints):
+                duplicates.look()
+                if found := (
+                        duplicates.planners(topics.PLANNER) or duplicates.devices(self._joints)):
                     raise HmsaError(_OTHERS if own else found)
                 self.pass_time(SLICE_SECONDS)
-            if own and presence.crowded(self._joints, topics.PLANNER):
+            if own and duplicates.crowded(self._joints, topics.PLANNER):
                 raise HmsaError(_OTHERS)
         finally:
-            presence.close()
+            duplicates.close()
 
     def pass_time(self, seconds: float) -> None:
         """Serve callbacks for a time in s."""

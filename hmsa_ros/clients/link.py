@@ -19,7 +19,7 @@ from hmsa.interfaces import topics
 from hmsa.interfaces.status import StatusVerdict
 from hmsa.model.status import Code
 from hmsa_ros.nodes import ros_entities
-from hmsa_ros.nodes.temporary_node import SLICE_SECONDS, Visitor
+from hmsa_ros.nodes.temporary_node import SLICE_SECONDS, TemporaryNode
 
 # Time limit in s for a stop, perhaps in slow motion; time until it is sent again to a planner that
 # has not answered, as one that was just discovered may not have received it; and interval of looks
@@ -38,7 +38,7 @@ _KNOWN = (*_FAILED, Code.UNHEARD, Code.CUT_OFF, Code.INTERLOCK)
 SILENCE = StatusVerdict(0, 'no reply from the planner yet', '', '', '', 0, 0)
 
 
-class Link(Visitor):
+class Link(TemporaryNode):
     """
     A link to the planner of a namespace; a context manager.
 

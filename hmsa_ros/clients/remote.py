@@ -18,22 +18,22 @@ from rclpy.validate_topic_name import validate_topic_name
 
 from hmsa.errors import BadInputError
 from hmsa_ros.nodes.service_call import ServiceCall
-from hmsa_ros.nodes.temporary_node import Visitor
+from hmsa_ros.nodes.temporary_node import TemporaryNode
 
 
 def _ask(
-        visitor: Visitor, name: str, kind: Any, service: str,
+        client: TemporaryNode, name: str, kind: Any, service: str,
         each: Callable[[], None] | None = None, **request: Any) -> Any:
     """Return a node's response to a request."""
-    return visitor.ask(
-        ServiceCall(visitor.node, kind, f'{name}/{service}', kind.Request(**request)),
-        f'no node {name} in namespace {visitor.node.get_namespace()} replies: expected '
+    return client.ask(
+        ServiceCall(client.node, kind, f'{name}/{service}', kind.Request(**request)),
+        f'no node {name} in namespace {client.node.get_namespace()} replies: expected '
         'one that runs, with the same ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE as here',
-        each, f'a reply of node {name} in namespace {visitor.node.get_namespace()}: does it run?')
+        each, f'a reply of node {name} in namespace {client.node.get_namespace()}: does it run?')
 
 
 def parameters_of(
-        visitor: Visitor, name: str, names: Sequence[str] = (),
+        client: TemporaryNode, name: str, names: Sequence[str] = (),
         each: Callable[[], None] | None = None) -> dict[str, Any]:
     """
     Return parameters of a node by name, by default all of them; None if not set.
@@ -48,7 +48,7 @@ def parameters_of(
         If the node does not reply.
 
     """
-    known = list(_ask(visitor, name, ListParameters, 'list_parameters', each).result.names)
+    known = list(_ask(client, name, ListParameters, 'list_parameters', each).result.names)
     if unknown := [x for x in names if x not in known]:
         near = get_close_matches(unknown[0], known, cutoff=0.5)
         raise BadInputError(
@@ -57,16 +57,16 @@ def parameters_of(
             + f'hmsa param get {name} lists all')
     wanted = sorted(names or known)
     types = _ask(
-        visitor, name, GetParameterTypes, 'get_parameter_types', each, names=wanted).types
+        client, name, GetParameterTypes, 'get_parameter_types', each, names=wanted).types
     # rclpy returns nothing at all if one of them is not set.
     there = [x for x, kind in zip(wanted, types, strict=True)
              if kind != ParameterType.PARAMETER_NOT_SET]
-    values = _ask(visitor, name, GetParameters, 'get_parameters', each, names=there).values
+    values = _ask(client, name, GetParameters, 'get_parameters', each, names=there).values
     return dict.fromkeys(wanted) | {
         x: parameter_value_to_python(y) for x, y in zip(there, values, strict=True)}
 
 
-class RemoteNode(Visitor):
+class RemoteNode(TemporaryNode):
     """
     The parameters of one node; a context manager.
 

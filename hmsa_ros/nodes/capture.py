@@ -309,7 +309,7 @@ def _function() -> Any:
     return found
 
 
-class Outlet:
+class FastPublisher:
     """
     Publish from one thread with a publisher of rclpy, while other threads run.
 

@@ -22,8 +22,8 @@ from hmsa_ros.device.protocol import Change, Kind, Notice
 from hmsa_ros.device.watchdog import Fallback, SAFE_FLUX
 from hmsa_ros.device.worker import STALL
 from hmsa_ros.nodes import conversions, ros_entities
-from hmsa_ros.nodes.capture import decode, Outlet, RawSubscription
-from hmsa_ros.nodes.duplicate_nodes import Presence
+from hmsa_ros.nodes.capture import decode, FastPublisher, RawSubscription
+from hmsa_ros.nodes.duplicate_nodes import DuplicateNodes
 from hmsa_ros.nodes.managed import ManagedNode, silence
 from hmsa_ros.nodes.parameters import JointParameters, JOINTS
 from hmsa_ros.runtime.throttle import Throttle
@@ -95,7 +95,7 @@ class DeviceJoint:
         self.received = self.refused = self.refused_source = 0
         self.late = self.latest = self.failed = 0
         self._applied, self._received = (
-            Outlet(ros_entities.publisher(node, topics.of_joint(x, self.name, names)))
+            FastPublisher(ros_entities.publisher(node, topics.of_joint(x, self.name, names)))
             for x in (topics.FLUX_DENSITY_APPLIED, topics.FLUX_DENSITY_RECEIVED))
         # Timestamps of the newest command, and of that of the last receipt; time of arrival of
         # the newest in ns, 0 if it is in a receipt; and steady time of the last receipt, and what
@@ -267,9 +267,9 @@ class SamplePublisher:
     """
 
     def __init__(self, node: Node, names: Sequence[str], *, scalars: bool) -> None:
-        self._states = Outlet(ros_entities.publisher(node, topics.JOINT_STATES))
+        self._states = FastPublisher(ros_entities.publisher(node, topics.JOINT_STATES))
         self._scalars = [
-            tuple(Outlet(ros_entities.publisher(node, topics.of_joint(x, name, names)))
+            tuple(FastPublisher(ros_entities.publisher(node, topics.of_joint(x, name, names)))
                   for x in (topics.STRETCH, topics.STRETCH_RATE))
             for name in names] if scalars else []
         count = len(names)
@@ -370,7 +370,7 @@ class DeviceNode(ManagedNode):
         self._publish_news()
         if not self.companion:
             self.every(TICK_SECONDS, self.on_tick)
-        self._presence = Presence(self, samples=False)
+        self._duplicates = DuplicateNodes(self, samples=False)
         self._diagnose = self.diagnose(self._report)
 
     def _report(self) -> Iterable[DiagnosticStatus]:
@@ -381,7 +381,7 @@ class DeviceNode(ManagedNode):
         for joint in self._joints:
             joint.close()
         if self._joints:
-            self._presence.close()
+            self._duplicates.close()
         self._joints = ()
 
     def close(self) -> None:
@@ -410,8 +410,8 @@ class DeviceNode(ManagedNode):
 
     def _find_rivals(self) -> str:
         """Return a message if other devices control a joint of this one, and log it once."""
-        self._presence.look()
-        rivals = self._presence.devices(self.values.names)
+        self._duplicates.look()
+        rivals = self._duplicates.devices(self.values.names)
         if rivals and rivals != self._rivals:
             self.get_logger().error(rivals)
         self._rivals = rivals

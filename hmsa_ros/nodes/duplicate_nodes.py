@@ -61,7 +61,7 @@ class Active:
         return {x for x, (_, last) in heard.items() if last >= newest}
 
 
-class Presence:
+class DuplicateNodes:
     """
     Find the running publishers of topics; to be called once a second.
 

@@ -25,7 +25,7 @@ from hmsa.interfaces import topics
 from hmsa.interfaces.parameters import ParameterSpec
 from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.address import AddressWatch
-from hmsa_ros.nodes.capture import Outlet
+from hmsa_ros.nodes.capture import FastPublisher
 from hmsa_ros.nodes.conversions import to_diagnostics, to_status
 from hmsa_ros.nodes.parameters import (
     check_former_names,
@@ -124,7 +124,7 @@ class ManagedNode(LifecycleNode):
     def diagnose(
             self, report: Callable[[], Iterable[DiagnosticStatus]]) -> Callable[[], None]:
         """Publish statuses once a second; return a function that publishes immediately."""
-        publisher = Outlet(ros_entities.publisher(self, topics.DIAGNOSTICS))
+        publisher = FastPublisher(ros_entities.publisher(self, topics.DIAGNOSTICS))
 
         def publish() -> None:
             statuses = [*report()]

@@ -26,7 +26,7 @@ from hmsa_ros.nodes import conversions, ros_entities
 from hmsa_ros.nodes.capture import decode, RawSubscription, Taken
 from hmsa_ros.nodes.cdr import read_trajectory, SampleReader, stamp_of
 from hmsa_ros.nodes.channel import JointChannel
-from hmsa_ros.nodes.duplicate_nodes import Presence
+from hmsa_ros.nodes.duplicate_nodes import DuplicateNodes
 from hmsa_ros.nodes.managed import ManagedNode
 from hmsa_ros.nodes.markers import TargetMarkers
 from hmsa_ros.nodes.parameters import declare_joints
@@ -135,7 +135,7 @@ class PlannerNode(ManagedNode):
         self._poll = self.every(_POLL_NS / NANOSECONDS, self._serve)
         if self.linked:
             self._poll.cancel()
-        self._presence = Presence(self)
+        self._duplicates = DuplicateNodes(self)
         if self._action is None:
             self._action = self._offer_action()
         else:
@@ -174,7 +174,7 @@ class PlannerNode(ManagedNode):
         """Drop the plans."""
         self._offload.close()
         self._jump.unregister()
-        self._presence.close()
+        self._duplicates.close()
         self._poll.cancel()
         self._channels = {}
         for subscription in (self._samples, self._newest):
@@ -388,9 +388,9 @@ class PlannerNode(ManagedNode):
 
     def _crowd(self) -> str:
         """Return a message if there are several planners, devices or clocks; else empty."""
-        self._presence.look()
-        rivals = self._presence.planners()
-        crowd = rivals or self._presence.devices(self._settings.names)
+        self._duplicates.look()
+        rivals = self._duplicates.planners()
+        crowd = rivals or self._duplicates.devices(self._settings.names)
         self._runtime.crowded = RefusedError(
             Code.SEVERAL_PLANNERS if rivals else Code.SEVERAL_PLANTS, crowd) if crowd else None
         clocks = self.count_publishers('/clock') if self.simulated else 1

@@ -107,7 +107,7 @@ def latched(reader: BagReader, topics: Iterable[str]) -> dict[str, int]:
             if any(profile.durability == 'transient_local' for profile in x)}
 
 
-class Audience:
+class RequiredSubscribers:
     """
     Subscribers of a node's topics; the node must be spun while `missing` is polled.
 

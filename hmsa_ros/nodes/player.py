@@ -40,12 +40,12 @@ from hmsa_ros.nodes.conversions import to_clock, to_status
 from hmsa_ros.nodes.managed import ManagedNode
 from hmsa_ros.nodes.parameters import declare
 from hmsa_ros.nodes.playback_publishers import (
-    Audience,
     create_senders,
     Followers,
     full_name,
     latched,
     NAMED_AT_MOST,
+    RequiredSubscribers,
 )
 from hmsa_ros.nodes.runner import run
 from hmsa_ros.nodes.selection import Filter
@@ -163,7 +163,7 @@ class Player(ManagedNode):
                 self._names('play.exclude_topics_to_filter'),
                 values['play.exclude_regex_to_filter']),
             own_clock=self._clock_out is not None)
-        self._audience = Audience(
+        self._required = RequiredSubscribers(
             self, {full_name(self, name): x for name, x in self._senders.items()},
             self._names('play.wait_for_subscribers'),
             self._names('play.wait_for_nodes'), ''.join(self._names('play.wait_for_recorder')))
@@ -261,7 +261,7 @@ class Player(ManagedNode):
         with contextlib.suppress(OSError):
             os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(_REALTIME_PRIORITY))
         try:
-            self._wait_for_audience(transport)
+            self._wait_for_required(transport)
             transport.rest(duration_from(self._values, 'play.delay') * 1e-9)
             self.get_logger().info(
                 f'playing {len(self._senders)} topics of {self._reader.path}, '
@@ -279,7 +279,7 @@ class Player(ManagedNode):
             transport.stop()
             self.finished = True
 
-    def _wait_for_audience(self, transport: PlaybackClock) -> None:
+    def _wait_for_required(self, transport: PlaybackClock) -> None:
         """Wait until the required subscribers are present."""
         begin = next_clock = time.monotonic()
         timeout = self._values['play.wait_for_subscribers_timeout']
@@ -289,8 +289,8 @@ class Player(ManagedNode):
             if self._clock_out is not None and now >= next_clock:
                 self._send_clock(self._excerpt.start)
                 next_clock = now + CLOCK_WHILE_WAITING_SECONDS
-            missing = self._audience.missing()
-            if not missing and (now >= settled or self._audience.found(self._clock_publisher)):
+            missing = self._required.missing()
+            if not missing and (now >= settled or self._required.found(self._clock_publisher)):
                 return
             if now >= quiet:
                 quiet = math.inf

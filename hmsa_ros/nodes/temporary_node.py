@@ -79,7 +79,7 @@ def visit(name: str, namespace: str, **options: Any) -> Node:
         f'{name}_{uuid4().hex[:8]}', namespace=namespace, context=context, **options)
 
 
-class Visitor:
+class TemporaryNode:
     """A node of `visit` with a default timeout in s; a context manager."""
 
     def __init__(self, name: str, namespace: str, timeout: float) -> None:
@@ -110,7 +110,7 @@ class Visitor:
         Raises
         ------
         HmsaError
-            If it does not become true within a timeout in s of ``time``, by default the visitor's.
+            If it does not become true within a timeout in s of ``time``, by default the node's.
         KeyboardInterrupt
             If a signal requested the end.
 
