@@ -16,10 +16,8 @@ from mcap.records import Channel, Schema
 
 from hmsa.bag import limits
 from hmsa.bag.definitions import ROS1
-from hmsa.bag.folder import advice_on
-from hmsa.bag.merge import Message
-from hmsa.bag.metadata import BagMetadata, FILE_NAME
-from hmsa.bag.records import MessageBlock
+from hmsa.bag.metadata import advice_on, BagMetadata, FILE_NAME
+from hmsa.bag.records import Message, MessageBlock
 from hmsa.bag.scan import ReadLimits
 from hmsa.errors import BadInputError
 
@@ -160,7 +158,7 @@ class ForeignFile:
 
 
 class ForeignCursor:
-    """A position in an iteration, with the interface of `hmsa.bag.merge.Cursor`."""
+    """A position in an iteration, with the interface of `hmsa.bag.records.Cursor`."""
 
     size = 0
 

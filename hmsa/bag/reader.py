@@ -27,12 +27,10 @@ from mcap.records import Schema
 
 from hmsa.bag import limits, metadata, qos
 from hmsa.bag.definitions import EMPTY, installed, make_decoder
-from hmsa.bag.folder import find
 from hmsa.bag.foreign import ForeignFile, is_foreign
-from hmsa.bag.merge import AnyCursor, merge, Message
-from hmsa.bag.metadata import BagTopic
+from hmsa.bag.metadata import BagTopic, find_files
 from hmsa.bag.output import EXPERIMENT
-from hmsa.bag.records import MessageBlock
+from hmsa.bag.records import AnyCursor, merge, Message, MessageBlock
 from hmsa.bag.scan import ReadLimits, ScannedFile
 from hmsa.errors import BadInputError, BagError, HmsaError
 
@@ -97,7 +95,7 @@ class BagReader:
         self._max_chunk_size = max_chunk_size
         intake = ReadLimits(max_chunk_size)
         self.problems = intake.problems
-        paths, self.metadata = find(self.path, intake.problem)
+        paths, self.metadata = find_files(self.path, intake.problem)
         self._files: list[ScannedFile | ForeignFile] = []
         for file_path in paths:
             try:

@@ -23,9 +23,8 @@ from mcap.records import (
 )
 
 from hmsa.bag import limits, records
-from hmsa.bag.folder import advice_on
-from hmsa.bag.merge import Cursor
-from hmsa.bag.records import MAGIC, MessageBlock, PREFIX
+from hmsa.bag.metadata import advice_on
+from hmsa.bag.records import Cursor, MAGIC, MessageBlock, PREFIX
 from hmsa.errors import BadInputError, BagError, printable
 
 # Messages outside chunks are grouped and handled like chunks.
