@@ -35,7 +35,7 @@ from hmsa.errors import HmsaError
 from hmsa.model.equations import elastic_force
 from hmsa_lab.bench.assembly import CoilModel
 from hmsa_lab.bench.simulated_board import TESLA_PER_AMPERE
-from hmsa_ros.device.protocol import Kind
+from hmsa_ros.device.watchdog import Kind
 
 RUNS, SEED = 20, 33_000
 #: Allowed error of the move after a fault, as a fraction of the step.

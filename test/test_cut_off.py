@@ -6,9 +6,8 @@ from hmsa.errors import BadInputError
 from hmsa.model.actuators import Setup
 from hmsa.model.parameters import paper_actuator
 from hmsa_ros.device.driven import HardwareDevice, HardwareJoint
-from hmsa_ros.device.protocol import Kind
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
-from hmsa_ros.device.watchdog import Fallback
+from hmsa_ros.device.watchdog import Fallback, Kind
 
 MS = 1_000_000
 START = 1000 * MS

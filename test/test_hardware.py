@@ -14,8 +14,7 @@ from hmsa_ros.device.clock_map import ClockMap
 from hmsa_ros.device.driven import HardwareDevice, HardwareJoint
 from hmsa_ros.device.hardware import Calls, load
 from hmsa_ros.device.interlock import judge_hardware
-from hmsa_ros.device.protocol import Kind
-from hmsa_ros.device.watchdog import Fallback
+from hmsa_ros.device.watchdog import Fallback, Kind
 from hmsa_ros.device.worker import HardwareWorker
 
 MS = 1_000_000

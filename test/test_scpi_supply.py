@@ -8,8 +8,7 @@ import pytest
 
 from hmsa_lab.bench.scpi_supply import ScpiSupply, SimulatedSupply, Supply, SupplyError
 from hmsa_ros.device.driven import HardwareDevice, HardwareJoint
-from hmsa_ros.device.protocol import Kind
-from hmsa_ros.device.watchdog import Fallback
+from hmsa_ros.device.watchdog import Fallback, Kind
 
 START = 10**18
 

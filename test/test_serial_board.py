@@ -24,8 +24,7 @@ from hmsa_lab.bench import _board, serial_board
 from hmsa_lab.bench.serial_board import Board, BoardError, framed, SerialBoard
 from hmsa_lab.bench.simulated_board import REST_LENGTH, SimulatedBoard, TESLA_PER_AMPERE
 from hmsa_ros.device.driven import HardwareDevice, HardwareJoint
-from hmsa_ros.device.protocol import Kind
-from hmsa_ros.device.watchdog import Fallback
+from hmsa_ros.device.watchdog import Fallback, Kind
 
 FIRMWARE = Path(_board.__file__).with_name('hmsa_board')
 SETTINGS = {'coil.tesla_per_ampere': TESLA_PER_AMPERE, 'sensor.rest_length': REST_LENGTH}

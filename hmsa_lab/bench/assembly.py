@@ -21,7 +21,7 @@ from hmsa.model.equations import Array
 from hmsa.model.units import NANOSECONDS
 from hmsa_lab.bench.iron_core import Compensation, IronCore
 from hmsa_ros.device.hardware import is_number, readings
-from hmsa_ros.device.protocol import StateLostError
+from hmsa_ros.device.watchdog import StateLostError
 
 # Fraction of its limit to which a coil that was too warm must cool.
 _COOL = 0.9

@@ -16,8 +16,7 @@ from hmsa.model.units import NANOSECONDS
 from hmsa_ros.device.coil import Coil, HardwareJoint
 from hmsa_ros.device.driven import HardwareDevice
 from hmsa_ros.device.hardware import Calls, load
-from hmsa_ros.device.protocol import Change
-from hmsa_ros.device.watchdog import Fallback
+from hmsa_ros.device.watchdog import Change, Fallback
 from hmsa_ros.device.worker import HardwareWorker
 
 # In s: lead time of levels, interval of heartbeats, silence after which the coil is cut off, limit

@@ -22,7 +22,7 @@ from hmsa.model.equations import Array
 from hmsa.model.units import NANOSECONDS
 from hmsa_lab.bench.bench import Bench, matched, PhaseResults, SILENCE
 from hmsa_ros.device.hardware import Calls, Instrument, load
-from hmsa_ros.device.protocol import StateLostError
+from hmsa_ros.device.watchdog import StateLostError
 
 # In s: duration of a phase of the trial, and limit for an end.
 _PHASE, _END = 0.6, 3.0

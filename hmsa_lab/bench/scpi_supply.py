@@ -9,7 +9,7 @@ from typing import Any
 from hmsa.errors import HmsaError
 from hmsa_lab.bench.assembly import Assembly, parts, require
 from hmsa_lab.bench.line import OnLine, SimulatedLine
-from hmsa_ros.device.protocol import StateLostError
+from hmsa_ros.device.watchdog import StateLostError
 
 
 class SimulatedSupply(SimulatedLine):

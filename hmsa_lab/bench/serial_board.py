@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 from hmsa.errors import HmsaError
 from hmsa_lab.bench.assembly import Assembly, parts, require
 from hmsa_lab.bench.line import OnLine
-from hmsa_ros.device.protocol import StateLostError
+from hmsa_ros.device.watchdog import StateLostError
 
 _VERSION = 1
 # Levels, readings and times are integer multiples of 1e-6 of their unit.

@@ -5,6 +5,6 @@ A `Device` accepts timestamped levels and is advanced to a time by its caller. I
 on ROS, and has neither threads nor a clock.
 """
 
-from hmsa_ros.device.protocol import StateLostError
+from hmsa_ros.device.watchdog import StateLostError
 
 __all__ = ['StateLostError']

@@ -11,8 +11,7 @@ from hmsa.errors import BadInputError
 from hmsa.model.schedule import CommandSchedule
 from hmsa.model.units import NANOSECONDS
 from hmsa_ros.device.hardware import Calls, Hardware, HardwareError, Instrument
-from hmsa_ros.device.protocol import Change, Kind, Notice, StateLostError
-from hmsa_ros.device.watchdog import Fallback, GuardedJoint
+from hmsa_ros.device.watchdog import Change, Fallback, GuardedJoint, Kind, Notice, StateLostError
 
 # Number of recent levels stored to determine the level at the time of an older sample.
 _REMEMBERED = 64

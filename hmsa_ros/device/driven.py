@@ -11,8 +11,7 @@ from hmsa.model.equations import Array
 from hmsa.model.sensor import Sample
 from hmsa_ros.device.coil import Coil, HardwareJoint
 from hmsa_ros.device.hardware import Calls, HardwareError
-from hmsa_ros.device.protocol import Kind
-from hmsa_ros.device.watchdog import Device
+from hmsa_ros.device.watchdog import Device, Kind
 from hmsa_ros.timekeeping import clock_set_words
 
 

@@ -18,8 +18,7 @@ from hmsa.errors import BadInputError, excerpt, HmsaError
 from hmsa.model.units import NANOSECONDS
 from hmsa.plugins import HARDWARE, registered
 from hmsa_ros.device.clock_map import ClockMap, ENOUGH
-from hmsa_ros.device.protocol import StateLostError
-from hmsa_ros.device.watchdog import ANOTHER_CLOCK
+from hmsa_ros.device.watchdog import ANOTHER_CLOCK, StateLostError
 
 T = TypeVar('T')
 

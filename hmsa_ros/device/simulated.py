@@ -9,8 +9,7 @@ from hmsa.model.sensor import Delay, Sample, Sensor, SensorErrors
 from hmsa.model.simulation import too_large
 from hmsa.model.thermal import checked_temperature, HOTTEST
 from hmsa.model.units import NANOSECONDS
-from hmsa_ros.device.protocol import Change, Kind
-from hmsa_ros.device.watchdog import Device, Fallback, GuardedJoint
+from hmsa_ros.device.watchdog import Change, Device, Fallback, GuardedJoint, Kind
 from hmsa_ros.timekeeping import clock_set_words
 
 # Change of temperature in K from which the simulated parameters follow: 1e-4 of any of them.

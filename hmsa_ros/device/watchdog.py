@@ -4,13 +4,13 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from enum import Enum
 import math
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 from hmsa.errors import BadInputError
 from hmsa.model.sensor import Sample
 from hmsa.model.units import NANOSECONDS
-from hmsa_ros.device.protocol import Change, Kind, Notice
 
 T = TypeVar('T')
 
@@ -24,6 +24,44 @@ _RAMP_STEP_NS = 1_000_000
 _REMEMBERED = 10_000
 #: Times that differ by more, in ns, come from clocks with different epochs.
 ANOTHER_CLOCK = 100_000_000 * NANOSECONDS
+
+
+class StateLostError(Exception):
+    """
+    Raised by ``write`` or ``read`` of hardware that has lost its state, such as a rebooted board.
+
+    Its coil is off then, and all earlier commands are discarded.
+    """
+
+
+class Change(NamedTuple):
+    """A level in T that took effect on a joint at a time in ns; NaN if unknown."""
+
+    joint: int
+    stamp: int
+    level: float
+
+
+class Kind(Enum):
+    """Subject of a notice."""
+
+    LATE = 'late'
+    SILENT = 'silent'
+    HEARD = 'heard'
+    REFUSED = 'refused'
+    FAILED = 'failed'
+    SATURATED = 'saturated'
+    LOST = 'lost'
+    CLOCK = 'clock'
+
+
+class Notice(NamedTuple):
+    """A message to log; ``late`` is a lateness in ns."""
+
+    kind: Kind
+    joint: int
+    text: str
+    late: int = 0
 
 
 @dataclass(frozen=True)

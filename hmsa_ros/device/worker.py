@@ -17,7 +17,7 @@ from hmsa.errors import BadInputError, HmsaError
 from hmsa.model.units import NANOSECONDS
 from hmsa_ros.device.driven import HardwareDevice
 from hmsa_ros.device.hardware import described, HardwareError
-from hmsa_ros.device.protocol import Kind
+from hmsa_ros.device.watchdog import Kind
 from hmsa_ros.timekeeping import steady_ns, StepWatch
 
 # In ns: a sleeping thread wakes up about 50 us late, and then waits for Python's global lock, at

@@ -16,7 +16,7 @@ from rclpy.node import Node
 from hmsa.interfaces import topics
 from hmsa.model.sensor import Sample
 from hmsa.model.units import NANOSECONDS
-from hmsa_ros.device.protocol import Change
+from hmsa_ros.device.watchdog import Change
 from hmsa_ros.nodes import conversions, ros_entities
 from hmsa_ros.nodes.device_node import DeviceNode, TICK_SECONDS
 from hmsa_ros.nodes.driver import DriverNode, HARDWARE, SHORT
