@@ -180,7 +180,7 @@ for words in (
 assert main(['report', 'run.csv']) == 2
 """)
     assert result.returncode == 0, result.stderr
-    assert re.search(r'\nhmsa: error: run.csv is not an MCAP file.*\n', result.stderr)
+    assert re.search(r'\nhmsa: error: run.csv is a table: expected a bag;.*\n', result.stderr)
 
 
 def test_nodes_start_without_scipy_which_takes_longer_to_load_than_all_else():
