@@ -312,7 +312,7 @@ class PlannerNode(ManagedNode):
         # which a path has a thousand a second.
         if self.simulated or self._channels and monotonic_ns() > self._due + _READ_NS:
             self._serve()
-        elif self._channels:
+        elif self._channels and (self._runtime.urgent or self._poll.is_canceled()):
             self._pace()
 
     def _pace(self, *, soon: bool = False) -> None:

@@ -412,10 +412,19 @@ class Runtime:
         return self._watch.hear(stamp) or self._takeover.waiting or self.follower.on
 
     @property
+    def urgent(self) -> bool:
+        """Whether there is work that waits for no time."""
+        return bool(
+            self._set_back or self._stepped or self.planning or self._takeover.waiting
+            or self._outputs or self._listens_until is not None
+            or self._takeover.engaged and (
+                self.deviations.verdicts
+                or self.deviations.astray - self.devices.receipts.silent))
+
+    @property
     def wake(self) -> int | None:
         """Time in ns of the next work; None for never, 0 for now."""
-        if (self._set_back or self._stepped or self.planning or self._takeover.waiting
-                or self._outputs or self._listens_until is not None):
+        if self.urgent:
             return 0
         if not self._takeover.engaged:
             return self._reporting.pending
@@ -429,8 +438,6 @@ class Runtime:
             times.append(now)
         if self.settings.heartbeat_period:
             times.append(self._next_beat)
-        if self.deviations.astray - self.devices.receipts.silent or self.deviations.verdicts:
-            times.append(0)
         if self.deviations.advises:
             times.append(now + LOOK)
         if self.devices.receipts or self._stops.open:
