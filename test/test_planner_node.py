@@ -26,7 +26,7 @@ from hmsa.planning.planner import Options, Planner
 from hmsa.planning.shapers.request import SmoothLimits
 from hmsa.planning.timeline import PlannedLevel
 from hmsa_ros.nodes.capture import Taken
-from hmsa_ros.nodes.cdr import SampleReader
+from hmsa_ros.nodes.cdr import JointStateReader
 from hmsa_ros.nodes.conversions import from_command, from_time, to_time, to_trajectory
 from hmsa_ros.nodes.planner import PlannerNode
 
@@ -712,7 +712,7 @@ def test_backward_jump_of_the_clock_drops_the_plan_and_says_so(bench):
 
 @pytest.mark.parametrize('sizes', [(3, 3, 3), (3, 0, 2), (0, 0, 0)])
 def test_samples_are_read_as_rclpy_reads_them_whatever_their_names(sizes):
-    reader = SampleReader()
+    reader = JointStateReader()
     for number in range(6):
         names = [f'joint_{k + number // 2}' for k in range(3)]
         position, velocity, effort = ([0.5 * number + x for x in range(n)] for n in sizes)

@@ -349,7 +349,7 @@ def test_controller_without_coefficients_says_nothing_of_the_temperature():
     loop.runtime.temperature('a', 0, 60.0)
     loop.runtime.request(StretchRequest('a', 1.2))
     loop.run(2 * NANOSECONDS)
-    assert loop.runtime.temperatures.joints == []
+    assert not loop.runtime.temperatures.joints
     assert not any('temperature' in x for x in loop.runtime.report()[2])
     assert loop.runtime.group.planners['a'].plan.levels[-1].flux_density == Setup(
         paper_actuator()).holding(1.2)

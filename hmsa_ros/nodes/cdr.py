@@ -80,7 +80,7 @@ def stamp_of(data: bytes) -> int:
         return 0
 
 
-class SampleReader:
+class JointStateReader:
     """Read serialized JointStates; names are decoded only if they differ from the last ones."""
 
     def __init__(self) -> None:

@@ -22,7 +22,7 @@ from hmsa.interfaces import topics
 from hmsa.model.units import NANOSECONDS
 from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.capture import RawSubscription, Taken
-from hmsa_ros.nodes.cdr import SampleReader
+from hmsa_ros.nodes.cdr import JointStateReader
 
 #: Time in s after its last message during which a process counts as running.
 LATELY_SECONDS = 2.5
@@ -74,7 +74,7 @@ class DuplicateNodes:
         self._samples: RawSubscription | None = None
         # Processes, and publishers of samples of a joint.
         self._processes, self._sampling = Active(), Active()
-        self._reader = SampleReader()
+        self._reader = JointStateReader()
 
     def look(self) -> None:
         """Process the messages that have arrived."""

@@ -23,7 +23,7 @@ from hmsa.interfaces import topics
 from hmsa.planning import path
 from hmsa_ros.nodes import conversions, ros_entities
 from hmsa_ros.nodes.capture import RawSubscription
-from hmsa_ros.nodes.cdr import read_trajectory, SampleReader
+from hmsa_ros.nodes.cdr import JointStateReader, read_trajectory
 from hmsa_ros.nodes.managed import ManagedNode
 from hmsa_ros.runtime.goals import ErrorCode, GoalResult, Goals
 from hmsa_ros.runtime.records import Severity, StatusChanged, Trajectory
@@ -50,7 +50,7 @@ class FollowJointTrajectory:
             action: Any, state: Any) -> None:
         """Create the server, which exists as long as the node and rejects goals meanwhile."""
         self._node, self._serve, self._action, self._state = node, serve, action, state
-        self._reader = SampleReader()
+        self._reader = JointStateReader()
         self._samples: RawSubscription | None = None
         self._accepted = ''
         self._handles: dict[str, ServerGoalHandle] = {}

@@ -24,7 +24,7 @@ from hmsa.offload import Offload
 from hmsa.plugins import FOLLOWER, registered
 from hmsa_ros.nodes import conversions, ros_entities
 from hmsa_ros.nodes.capture import decode, RawSubscription, Taken
-from hmsa_ros.nodes.cdr import read_trajectory, SampleReader, stamp_of
+from hmsa_ros.nodes.cdr import JointStateReader, read_trajectory, stamp_of
 from hmsa_ros.nodes.channel import JointChannel
 from hmsa_ros.nodes.duplicate_nodes import DuplicateNodes
 from hmsa_ros.nodes.managed import ManagedNode
@@ -84,7 +84,7 @@ class PlannerNode(ManagedNode):
         self._steps = StepWatch()
         self._runtime = self._new_runtime()
         self._channels: dict[str, JointChannel] = {}
-        self._reader = SampleReader()
+        self._reader = JointStateReader()
         self._samples: RawSubscription | None = None
         self._newest: RawSubscription | None = None
         self._listen_until = self._read = 0

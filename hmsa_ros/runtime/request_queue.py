@@ -247,7 +247,7 @@ class RequestQueue:
                 'has acknowledged it')
         if severity is Severity.OK and not plans:
             code, words = Code.UNCHANGED, 'already on the way there: the plan is unchanged'
-        if why := self.temperatures.words():
+        if self.temperatures.joints and (why := self.temperatures.words()):
             words = f'{words}; {why}'
         self._reporting.give(
             Verdict(severity, code, words, request.name), log=severity is not Severity.OK)

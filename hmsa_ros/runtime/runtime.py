@@ -392,6 +392,7 @@ class Runtime:
         self._follow()
         for name, model in self.follower.change(settings, models).items():
             self.group.planners[name].take_model(model)
+        self.temperatures.change()
         self.group.simultaneous = simultaneous
 
     def _prepare(self) -> None:

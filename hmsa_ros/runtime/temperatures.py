@@ -37,11 +37,14 @@ class Temperatures:
         self._stale = ''
         self._refused_due = Throttle()
         self.followed = 0  # number of plans made again for a temperature
+        #: Joints whose parameters change with the temperature.
+        self.joints: tuple[str, ...] = ()
+        self.change()
 
-    @property
-    def joints(self) -> list[str]:
-        """Joints whose parameters change with the temperature."""
-        return [name for name, x in self._group.planners.items() if x.warmth is not None]
+    def change(self) -> None:
+        """Adopt the models of the joints."""
+        self.joints = tuple(
+            name for name, x in self._group.planners.items() if x.warmth is not None)
 
     def measured(self, joint: str, stamp: int, temperature: float) -> None:
         """Take the temperature of a joint in degrees Celsius, of a time in ns; 0 for now."""
