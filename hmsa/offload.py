@@ -68,7 +68,7 @@ class Offload:
     def __init__(self, report: Callable[[str], None], module: str, count: int = 1) -> None:
         self._report, self._module = report, module
         self.count = max(min(count, len(os.sched_getaffinity(0))), 1)
-        self._workers: list[_Worker] = []
+        self._workers: list[_Process] = []
         self._lost = False
 
     def __call__(self, work: Callable[..., T], *arguments: object) -> Awaited[T]:
@@ -92,7 +92,7 @@ class Offload:
         """Start the processes if they are not running."""
         try:
             while len(self._workers) < self.count and not self._lost:
-                self._workers.append(_Worker(self._module))
+                self._workers.append(_Process(self._module))
         except OSError:
             self._lose()
 
@@ -112,7 +112,7 @@ class Offload:
             worker.end()
 
 
-class _Worker:
+class _Process:
     """The process and its pending work."""
 
     def __init__(self, module: str) -> None:

@@ -49,7 +49,7 @@ def _between(segment: Segment, time: float, shown: Callable[[float], float]) -> 
     ) if len(inside) <= _MOST_BETWEEN else f'{len(inside)} levels'
 
 
-class PlannedLevel(NamedTuple):
+class FieldLevel(NamedTuple):
     """A field level of a plan."""
 
     time: float  #: from which it is valid, in s
@@ -130,14 +130,14 @@ class Plan:
     def __len__(self) -> int:
         return len(self.levels)
 
-    def __iter__(self) -> Iterator[PlannedLevel]:
-        return (PlannedLevel(*x) for x in self.levels.tolist())
+    def __iter__(self) -> Iterator[FieldLevel]:
+        return (FieldLevel(*x) for x in self.levels.tolist())
 
     @overload
-    def __getitem__(self, key: SupportsIndex) -> PlannedLevel: ...
+    def __getitem__(self, key: SupportsIndex) -> FieldLevel: ...
 
     @overload
-    def __getitem__(self, key: slice) -> tuple[PlannedLevel, ...]: ...
+    def __getitem__(self, key: slice) -> tuple[FieldLevel, ...]: ...
 
     def __getitem__(self, key: Any) -> Any:
         return tuple(self)[key]

@@ -27,7 +27,7 @@ from hmsa.runs import topics as roles
 from hmsa.runs.levels import RecordedLevel
 from hmsa.runs.parameters import actuators, named_joint, recorded
 from hmsa.runs.record import LearntSensor, RecordedVerdict, Run
-from hmsa.runs.samples import nanoseconds_of, SampleReader
+from hmsa.runs.samples import nanoseconds_of, SampleColumns
 from hmsa.runs.topics import topics_by_joint, unanswered
 
 # Time between samples that is a gap in a bag with missing messages, relative to the median.
@@ -190,7 +190,7 @@ class _Collected:
     """Data read so far for the actuators of one namespace; dictionaries are by joint."""
 
     def __init__(self) -> None:
-        self.samples = SampleReader()
+        self.samples = SampleColumns()
         self.commands: defaultdict[str, list[RecordedLevel]] = defaultdict(list)
         self.applied: defaultdict[str, list[RecordedLevel]] = defaultdict(list)
         self.forces: defaultdict[str, list[tuple[int, int, float]]] = defaultdict(list)

@@ -32,8 +32,8 @@ def nanoseconds_of(stamp: Any) -> int:
 _Shape = tuple[tuple[str, ...], int, int, int]
 
 
-class SampleReader:
-    """Reader of joint states with any joints and shapes."""
+class SampleColumns:
+    """Columns of joint states with any joints and shapes."""
 
     def __init__(self) -> None:
         # Recording times and timestamps, and the values, row by row.
