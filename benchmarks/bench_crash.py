@@ -74,7 +74,7 @@ class Recorder:
         from rosbags.rosbag2 import Reader
 
         from hmsa.bag.reader import BagReader
-        from hmsa.bag.recover import recover
+        from hmsa.bag.writer import recover
         self.process.wait()
         recovered = self.folder.with_name(self.folder.name + '_recovered')
         recover(self.folder, recovered)

@@ -145,7 +145,7 @@ def check_bag(folder: Path, kind: str, killed: str, step: int = _STEP_NS) -> Cyc
     """Check a bag for gaps, integrate its commands again, and remove it if it has no fault."""
     from hmsa.bag.info import missing_messages
     from hmsa.bag.reader import BagReader
-    from hmsa.bag.recover import recover
+    from hmsa.bag.writer import recover
     from hmsa.errors import HmsaError
     from hmsa.runs.verify import verify
     from hmsa_ros.nodes.cdr import stamp_of

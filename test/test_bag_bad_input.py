@@ -22,8 +22,7 @@ from hmsa.bag.definitions import message_definition, type_hash
 from hmsa.bag.info import summarize, to_json, to_text
 from hmsa.bag.reader import BagReader, read_messages
 from hmsa.bag.records import MAGIC, MessageBlock, PREFIX
-from hmsa.bag.recover import recover
-from hmsa.bag.writer import BagTopic, BagWriter
+from hmsa.bag.writer import BagTopic, BagWriter, recover
 from hmsa.cli import main
 from hmsa.errors import BadInputError, BagError
 

@@ -18,8 +18,7 @@ from hmsa.bag import metadata
 from hmsa.bag.output import OutputFile
 from hmsa.bag.reader import BagReader
 from hmsa.bag.reception import judge, WARN
-from hmsa.bag.recover import recover
-from hmsa.bag.writer import BagTopic, BagWriter
+from hmsa.bag.writer import BagTopic, BagWriter, recover
 from hmsa.bag.writer_thread import lost_by_topic, RecordingLimits, WriterThread
 from hmsa.errors import BadInputError, BagError
 

@@ -18,8 +18,7 @@ import zstandard
 from hmsa.bag import limits, metadata
 from hmsa.bag.definitions import message_definition
 from hmsa.bag.reader import BagReader, read_messages
-from hmsa.bag.recover import recover
-from hmsa.bag.writer import BagTopic, BagWriter
+from hmsa.bag.writer import BagTopic, BagWriter, recover
 from hmsa.cli import main
 from hmsa.errors import BadInputError, BagError
 
@@ -34,7 +33,7 @@ READER = """
 import os, resource, sys
 from hmsa.bag.info import summarize, to_json, to_text
 from hmsa.bag.reader import BagReader
-from hmsa.bag.recover import recover
+from hmsa.bag.writer import recover
 from hmsa.errors import HmsaError
 import lz4.frame, mcap_ros2.decoder, zstandard
 

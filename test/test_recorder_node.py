@@ -23,8 +23,7 @@ from hmsa.bag.definitions import message_definition, type_hash
 from hmsa.bag.info import missing_messages, summarize, to_text
 from hmsa.bag.qos import Qos
 from hmsa.bag.reader import BagReader, read_messages
-from hmsa.bag.recover import recover
-from hmsa.bag.writer import BagTopic, BagWriter
+from hmsa.bag.writer import BagTopic, BagWriter, recover
 from hmsa.cli import main
 from hmsa.model.units import NANOSECONDS
 from hmsa_ros.nodes.capture import RawSubscription

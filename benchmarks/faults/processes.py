@@ -22,7 +22,7 @@ from benchmarks.faults.common import (
 from benchmarks.faults.rig import Rig, settled
 from benchmarks.faults.table import Seen
 from hmsa.bag.reader import BagReader
-from hmsa.bag.recover import recover
+from hmsa.bag.writer import recover
 from hmsa.interfaces import topics
 
 FAULTS = Register()

@@ -3,13 +3,14 @@ Write a bag: a folder of MCAP files and ``metadata.yaml``, in the layout of rosb
 
 The bag is readable at any time: each flush ends a chunk and passes it to the operating system,
 ``metadata.yaml`` exists from the start, and a write that fails is rolled back. Message payloads
-are stored as given.
+are stored as given. A bag that is damaged, by a crash or a full disk, is written anew as far as it
+can be read.
 """
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 import contextlib
-from dataclasses import replace
+from dataclasses import dataclass, replace
 import itertools
 import operator
 import os
@@ -17,7 +18,8 @@ from pathlib import Path
 import re
 
 from hmsa import __version__
-from hmsa.bag import metadata, qos
+from hmsa.bag import limits, metadata, qos
+from hmsa.bag.definitions import ROS1
 from hmsa.bag.metadata import BagTopic
 from hmsa.bag.output import Entry, OutputFile, PRESETS
 from hmsa.bag.reader import BagReader, number_of
@@ -384,3 +386,43 @@ def parse_custom_data(pairs: Iterable[str]) -> dict[str, str]:
             raise BadInputError(f'custom data has the key {key.strip()!r} twice: expected once')
         values[key.strip()] = value
     return values
+
+
+@dataclass(frozen=True)
+class Recovered:
+    """Folder and number of messages of the new bag, and the unreadable parts of the old one."""
+
+    folder: str
+    message_count: int
+    problems: tuple[str, ...]
+
+
+def recover(
+        path: str | os.PathLike[str], out: str | os.PathLike[str], *,
+        max_chunk_size: int = limits.CHUNK_SIZE) -> Recovered:
+    """Write all that can be read of a bag to a new one; raise `BagError` unless it reads back."""
+    reader = BagReader(path, max_chunk_size=max_chunk_size)
+    if any(topic.encoding == ROS1 for topic in reader.topics.values()):
+        raise BadInputError(
+            f'{path} is a bag of ROS 1, whose messages are encoded otherwise: expected one of ROS '
+            f'2; convert it with "rosbags-convert --src {path} --dst {out} --dst-storage mcap"')
+    try:
+        with BagWriter(out, custom_data=reader.custom_data) as writer:
+            numbers = {name: writer.add_topic(replace(topic, type=topic.type or 'unknown'))
+                       for name, topic in reader.topics.items()}
+            writer.write((
+                numbers[x.topic], x.log_time, x.publish_time, x.sequence, x.data)
+                for x in reader.stored_messages())
+        expected = writer.topic_counts()
+    except OSError as error:
+        raise BagError(f'{out} cannot be written: {error.strerror or error}') from error
+    check = BagReader(out, max_chunk_size=max_chunk_size + limits.CHUNK_SIZE)
+    found = dict.fromkeys(check.topics, 0)
+    for message in check.messages():
+        found[message.topic] += 1
+    if not check.complete or found != expected:
+        raise BagError(f'{out} does not read back as written: '
+                       + ('; '.join(check.problems) or f'{found}, expected {expected}'))
+    # The count comes last because it may find more damage.
+    reader.counts()
+    return Recovered(str(out), sum(found.values()), tuple(reader.problems))

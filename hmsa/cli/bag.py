@@ -126,7 +126,7 @@ def _recover(arguments: argparse.Namespace) -> int:
 
     example: hmsa bag recover cut_off_run --out saved_run
     """
-    from hmsa.bag.recover import recover
+    from hmsa.bag.writer import recover
     with progress('recovering'):
         result = recover(
             arguments.bag, arguments.out, max_chunk_size=_chunk_size(arguments))
