@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 import hmsa
-from hmsa.api.choice import choose, compare_shapers, Expected
 from hmsa.cli import main
 from hmsa.errors import BadInputError
 from hmsa.identification.files import read_belief
@@ -21,7 +20,7 @@ from hmsa.identification.measurement import Measurement
 from hmsa.model.parameters import paper_actuator
 from hmsa.runs.bags import read_run
 from hmsa.runs.parameters import read_parameter_file
-from hmsa_lab.experiments.tuning import chosen, Tuning
+from hmsa_lab.experiments.tuning import choose, chosen, compare_shapers, Expected, Tuning
 
 RUN_SECONDS = 300.0
 MOVES = ((1.1, 0.3), (1.0, 0.3), (1.2, 0.3))
