@@ -18,9 +18,8 @@ from hmsa.model.residual import percent
 from hmsa.planning.shapers import SHAPERS
 from hmsa.planning.shapers.request import MoveRequest, SmoothLimits
 from hmsa.report.paper import SCREEN
-from hmsa_studies.moves import damped_study, DampedStudy, LIMITS, sampled_study
 from hmsa_studies.pictures import draw_damped, draw_front, draw_robustness, draw_sampled
-from hmsa_studies.residual import Actual, Errors
+from hmsa_studies.residual import Actual, damped_study, DampedStudy, Errors, LIMITS, sampled_study
 from hmsa_studies.robustness import Candidate, candidates, Case, PARAMETERS, Result, study
 from hmsa_studies.sweep import parse_grid, Sweep
 from hmsa_studies.sweep_pictures import draw_sweep

@@ -18,7 +18,8 @@ from hmsa.planning.shapers.request import MoveRequest
 from hmsa.report import looks, style
 from hmsa.report.looks import LineStyle
 from hmsa.report.paper import Paper
-from hmsa_studies.moves import (
+from hmsa_studies.residual import (
+    Actual,
     DampedStudy,
     ideal_move,
     LIMITS,
@@ -29,7 +30,6 @@ from hmsa_studies.moves import (
     SETTLED,
     solved_move,
 )
-from hmsa_studies.residual import Actual
 from hmsa_studies.robustness import Candidate, Case, ORDERED, Result
 
 # Smaller residuals are drawn at this value.

@@ -28,9 +28,16 @@ from hmsa.model.status import Code
 from hmsa.planning.two_step import plan_two_step
 from hmsa_studies.__main__ import tables
 from hmsa_studies.axes import MOST_VALUES, parse_grid, read_cases
-from hmsa_studies.moves import damped_study, ideal_move, sampled_study, settling_time
 from hmsa_studies.pictures import draw_damped, draw_front, draw_robustness, draw_sampled
-from hmsa_studies.residual import Actual, arrival_of, Errors
+from hmsa_studies.residual import (
+    Actual,
+    arrival_of,
+    damped_study,
+    Errors,
+    ideal_move,
+    sampled_study,
+    settling_time,
+)
 from hmsa_studies.robustness import (
     Candidate,
     candidates,
