@@ -35,7 +35,7 @@ from hmsa.model.parameters import ActuatorParameters, paper_actuator
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Options, Planner
 from hmsa.planning.timeline import PlannedSegment
-from hmsa.runs.levels import ROUNDED
+from hmsa.runs.record import ROUNDED
 from hmsa_lab.bench import _board, line, serial_board
 from hmsa_lab.bench.assembly import Assembly, CoilModel, SensorScale
 from hmsa_lab.bench.calibration import calibrate_coil, decay, loop

@@ -19,8 +19,7 @@ from hmsa.model.sensor import SensorErrors
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Options, Planner
 from hmsa.report.outcome import findings_of
-from hmsa.runs.levels import RecordedLevel
-from hmsa.runs.record import LearntSensor, Run
+from hmsa.runs.record import LearntSensor, RecordedLevel, Run
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.runtime.records import (
     Environment,

@@ -42,7 +42,7 @@ from hmsa.report.outcome import findings_of, level_results
 from hmsa.report.page import page
 from hmsa.report.picture import draw
 from hmsa.runs.bags import read_run, read_runs
-from hmsa.runs.levels import in_force, RecordedLevel, without_repeats
+from hmsa.runs.record import in_force, RecordedLevel, without_repeats
 from hmsa.runs.setpoints import described
 from hmsa.runs.topics import (
     APPLIED,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hmsa.runs.bags import read_runs
-from hmsa.runs.levels import without_repeats
+from hmsa.runs.record import without_repeats
 
 RUN_SECONDS = 300.0
 SETPOINTS = ('1.10:0.1', '1.20:0.1', '1.00:0.1')

@@ -21,9 +21,8 @@ from hmsa.model.parameters import paper_actuator
 from hmsa.model.simulation import ActuatorSimulation
 from hmsa.model.units import NANOSECONDS
 from hmsa.runs import bags
-from hmsa.runs.levels import lateness_of, RecordedLevel
 from hmsa.runs.parameters import actuators, read_parameter_file, recorded, values_of
-from hmsa.runs.record import Run
+from hmsa.runs.record import lateness_of, RecordedLevel, Run
 from hmsa.runs.tables import levels_of, samples_of, write_table
 from hmsa.runs.topics import APPLIED, COMMAND
 from hmsa.runs.verify import verify_run

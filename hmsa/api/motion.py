@@ -14,8 +14,7 @@ from hmsa.interfaces.outcome import Outcome
 from hmsa.model.equations import Array
 from hmsa.model.simulation import longest_motion, response
 from hmsa.model.units import NANOSECONDS
-from hmsa.runs.levels import RecordedLevel
-from hmsa.runs.record import read_only, Run
+from hmsa.runs.record import read_only, RecordedLevel, Run
 from hmsa.runs.setpoints import described
 from hmsa.runs.tables import levels_of, samples_of, write_run
 from hmsa.table import frame, Table

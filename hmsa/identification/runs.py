@@ -11,8 +11,7 @@ from hmsa.interfaces.topics import PLANNER
 from hmsa.model.parameters import ActuatorParameters
 from hmsa.model.units import NANOSECONDS
 from hmsa.runs.bags import read_run
-from hmsa.runs.levels import in_force, without_repeats
-from hmsa.runs.record import Run
+from hmsa.runs.record import in_force, Run, without_repeats
 
 
 def read_bag(

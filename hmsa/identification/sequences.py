@@ -9,8 +9,7 @@ from hmsa.errors import BadInputError
 from hmsa.identification.learning import learn, Learnt, SequenceRepeat, TargetWindow
 from hmsa.interfaces.outcome import LEVELS
 from hmsa.model.units import NANOSECONDS
-from hmsa.runs.levels import ROUNDED
-from hmsa.runs.record import Run
+from hmsa.runs.record import ROUNDED, Run
 from hmsa.runs.setpoints import setpoints_of
 
 

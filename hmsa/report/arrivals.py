@@ -12,8 +12,7 @@ from hmsa.model.residual import percent
 from hmsa.model.units import NANOSECONDS
 from hmsa.report.curves import TimeCurve
 from hmsa.report.evaluation import evaluate, Evaluation, MoveResult, verdicts
-from hmsa.runs.levels import lateness_of, RecordedLevel, without_repeats
-from hmsa.runs.record import Run, Times
+from hmsa.runs.record import lateness_of, RecordedLevel, Run, Times, without_repeats
 
 # A change of level that took effect within this time in s of its timestamp was on time: the clock
 # of a board with a schedule of its own is known to a few us.

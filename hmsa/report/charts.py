@@ -19,7 +19,7 @@ from hmsa.report.arrivals import around, left_text, Part, results_of, span, wors
 from hmsa.report.curves import decimate, TimeCurve
 from hmsa.report.figures import Axis, Curve, Panel
 from hmsa.report.looks import BLACK, BLUE, LineStyle, VERMILION
-from hmsa.runs.levels import held_at
+from hmsa.runs.record import held_at
 
 #: Maximum number of setpoints with a panel of their own in a page.
 MOST_PANELS = 12

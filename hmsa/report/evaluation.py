@@ -29,9 +29,8 @@ from hmsa.model.simulation import follow, response, sampled
 from hmsa.model.units import NANOSECONDS
 from hmsa.report.curves import fine, through, TimeCurve
 from hmsa.report.outcome import findings_of, tolerances_of
-from hmsa.runs.levels import in_force, RecordedLevel, without_repeats
 from hmsa.runs.parameters import creep_of
-from hmsa.runs.record import Run, Times
+from hmsa.runs.record import in_force, RecordedLevel, Run, Times, without_repeats
 from hmsa.runs.setpoints import SAME, setpoints_of, start_of
 
 #: With fewer samples per period, peaks are missed.

@@ -24,9 +24,8 @@ from hmsa.model.schedule import is_axial_field
 from hmsa.model.thermal import COLDEST, HOTTEST
 from hmsa.model.units import NANOSECONDS
 from hmsa.runs import topics as roles
-from hmsa.runs.levels import RecordedLevel
 from hmsa.runs.parameters import actuators, named_joint, recorded
-from hmsa.runs.record import LearntSensor, RecordedVerdict, Run
+from hmsa.runs.record import LearntSensor, RecordedLevel, RecordedVerdict, Run
 from hmsa.runs.samples import nanoseconds_of, SampleColumns
 from hmsa.runs.topics import topics_by_joint, unanswered
 

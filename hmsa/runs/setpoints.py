@@ -17,8 +17,7 @@ from hmsa.model.equations import Array, equilibrium_stretch, natural_frequency, 
 from hmsa.model.law import critical_zeta
 from hmsa.model.parameters import ActuatorParameters
 from hmsa.model.units import NANOSECONDS
-from hmsa.runs.levels import in_force, RecordedLevel, without_repeats
-from hmsa.runs.record import Run
+from hmsa.runs.record import in_force, RecordedLevel, Run, without_repeats
 
 #: Smaller differences of stretch do not change a setpoint.
 SAME = 1e-6

@@ -12,8 +12,7 @@ from hmsa.errors import BadInputError
 from hmsa.files import replacing, require_arrow
 from hmsa.model.equations import Array
 from hmsa.model.units import NANOSECONDS
-from hmsa.runs.levels import held_at
-from hmsa.runs.record import Run
+from hmsa.runs.record import held_at, Run
 
 SUFFIXES = ('.csv', '.parquet', '.mat')
 

@@ -26,15 +26,15 @@ from hmsa.model.creep import Creep
 from hmsa.model.equations import Array
 from hmsa.model.units import NANOSECONDS
 from hmsa.runs.bags import read_runs
-from hmsa.runs.levels import (
+from hmsa.runs.parameters import creep_of, of_joint
+from hmsa.runs.record import (
     in_force,
     lateness_of,
     RecordedLevel,
     ROUNDED_STAMP,
+    Run,
     without_repeats,
 )
-from hmsa.runs.parameters import creep_of, of_joint
-from hmsa.runs.record import Run
 from hmsa.runs.samples import CLOCK_JUMP
 from hmsa.runs.topics import APPLIED, COMMAND, FORCE, JOINT_STATES
 

@@ -27,7 +27,7 @@ from hmsa.planning.planner import Options, Planner
 from hmsa.report.evaluation import MoveResult
 from hmsa.report.outcome import findings_of
 from hmsa.runs.bags import read_runs
-from hmsa.runs.levels import without_repeats
+from hmsa.runs.record import without_repeats
 from hmsa_ros.clients.experiment import conduct, Experiment
 from hmsa_ros.clients.processes import NodeProcess
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
