@@ -2,7 +2,7 @@
 Ten minutes of moves while the coil warms the block by 15 K, for planners that know more or less.
 
 The actuator is simulated with its temperature. The controller of the nodes moves it in simulated
-time, in open loop with or without the temperature, or with feedback without it.
+time, in open loop or with feedback, with or without the temperature.
 """
 
 from dataclasses import dataclass, replace
@@ -25,17 +25,19 @@ from hmsa_ros.runtime.records import Settings, StretchRequest
 #: of the damping is assumed.
 SILICONE = Thermal(
     shear_modulus=0.0035, remanence=-0.0011, damping_coefficient=-0.005, time_constant=150.0)
-#: Warming in K in ten minutes, targets in turn, and duration of each setpoint in s.
-WARMING, TARGETS, DWELL = 15.0, (1.1, 1.2, 1.3, 1.2), 20.0
-_DURATION, _JOINT = 600.0, 'actuator'
+#: Warming in K in a duration in s, targets in turn, and duration of each setpoint in s.
+WARMING, DURATION, TARGETS, DWELL = 15.0, 600.0, (1.1, 1.2, 1.3, 1.2), 20.0
+_JOINT = 'actuator'
 # The example block with L = 100 mm, whose time scale of 44 ms takes fewer samples.
 _HALF_LENGTH = 0.1
 # Points at which the motion after an arrival is looked at, and its duration in time scales.
 _LOOK, _AFTER = 200, 8.0
 #: What a planner may know: the measured temperature; that, and how the coil warms; the latter
-#: alone; nothing; or samples, with noise, and nothing of the temperature.
-WAYS = ('measured', 'measured and foreseen', 'foreseen', 'ignored', 'feedback')
-_NOISE, _PERIOD = 3e-4, {'feedback': 0.005}
+#: alone; nothing, not even that the temperature changes anything; or samples, with noise, without
+#: and with the measured temperature.
+WAYS = ('measured', 'measured and foreseen', 'foreseen', 'ignored', 'feedback',
+        'measured and feedback')
+_NOISE, _PERIOD, _FEEDBACK_PERIOD = 3e-4, 0.05, 0.005
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,8 @@ class Left:
     offset: float  #: at the arrival
     drifted: float  #: at the end of the setpoint
     temperature: float  #: at the arrival, in degrees Celsius
+    #: Shear modulus that plans take at the end, at the same temperature, over the true one.
+    modulus: float
 
     @property
     def worst(self) -> float:
@@ -61,11 +65,12 @@ def block() -> ActuatorParameters:
         remanence=0.1)
     setup = Setup(made)
     level = np.mean([setup.holding(x) ** 2 for x in TARGETS])
-    reached = 1.0 - np.exp(-_DURATION / SILICONE.time_constant)
+    reached = 1.0 - np.exp(-DURATION / SILICONE.time_constant)
     return replace(made, thermal=replace(SILICONE, rise=float(WARMING / level / reached)))
 
 
-def warming(way: str) -> list[Left]:
+def warming(
+        way: str, *, stiffer: float = 0.0, duration: float = DURATION) -> list[Left]:
     """
     Run the moves.
 
@@ -73,6 +78,10 @@ def warming(way: str) -> list[Left]:
     ----------
     way : str
         What the planner knows, one of `WAYS`.
+    stiffer : float
+        Relative error of the shear modulus that the planner is given.
+    duration : float
+        Duration of the run in s.
 
     Returns
     -------
@@ -82,18 +91,20 @@ def warming(way: str) -> list[Left]:
     """
     truth = block()
     known = {
-        'measured': replace(truth.thermal, rise=0.0), 'measured and foreseen': truth.thermal,
-        'foreseen': truth.thermal}.get(way, Thermal())
-    feedback = way == 'feedback'
+        'ignored': Thermal(), 'measured and foreseen': truth.thermal,
+        'foreseen': truth.thermal}.get(way, replace(truth.thermal, rise=0.0))
+    feedback = way.endswith('feedback')
     device = SimulatedDevice(
         [SimulatedJoint(Setup(truth), errors=SensorErrors(_NOISE if feedback else 0.0))],
-        period=round(_PERIOD.get(way, 0.05) * NANOSECONDS), time=NANOSECONDS)
-    planner = Planner(replace(truth, thermal=known), Options(
+        period=round((_FEEDBACK_PERIOD if feedback else _PERIOD) * NANOSECONDS),
+        time=NANOSECONDS)
+    planner = Planner(replace(
+        truth, thermal=known, shear_modulus=(1.0 + stiffer) * truth.shear_modulus), Options(
         flux_density_min=-0.5, flux_density_max=0.5, lead_time=5_000_000))
     loop = Loop(PlannerGroup({_JOINT: planner}), Settings(
         takeover_timeout=0, feedback='adapt' if feedback else 'off'), device)
     found, start = [], truth.rest
-    for number in range(round(_DURATION / DWELL)):
+    for number in range(round(duration / DWELL)):
         target = TARGETS[number % len(TARGETS)]
         loop.runtime.request(StretchRequest(_JOINT, target))
         arrival = planner.plan.segments[-1].arrival or loop.now
@@ -107,7 +118,9 @@ def warming(way: str) -> list[Left]:
         step = target - start
         found.append(Left(
             target, left[0] / abs(step), left[1] / step,
-            (float(device.stretch[0]) - target) / step, left[2]))
+            (float(device.stretch[0]) - target) / step, left[2],
+            planner.base.at_temperature(known.reference).actuator.shear_modulus
+            / truth.shear_modulus))
         start = target
     return found
 

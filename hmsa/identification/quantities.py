@@ -18,6 +18,7 @@ from hmsa.model.laws import LAWS
 from hmsa.model.laws.record import Constant, Elastic
 from hmsa.model.modes import Modes
 from hmsa.model.parameters import ActuatorParameters, Geometry, NondimensionalParameters
+from hmsa.model.thermal import COLDEST, HOTTEST, Thermal
 
 
 @dataclass(frozen=True)
@@ -115,6 +116,9 @@ _OF_LAWS = {
         advice='record larger stretches of both signs, and rest at three or more levels; or '
                'choose a law with fewer constants')
     for law in LAWS.values() for x in law.constants if x.place >= 0}
+#: Temperature of an actuator with coefficients, which only feedback estimates.
+TEMPERATURE = 'temperature'
+_ONLY_TRACKED = {TEMPERATURE: Quantity('degrees Celsius', math.nan, 'linear', COLDEST, HOTTEST)}
 #: Free by default.
 DEFAULT_FREE = (
     'shear_modulus', 'damping_coefficient', 'chain_limit', 'remanence', 'stretch_bias')
@@ -290,7 +294,8 @@ def actuator_of(values: Mapping[str, Any]) -> ActuatorParameters:
         damping_coefficient=values['damping_coefficient'], law=values.get('law'),
         creep=values.get('creep', Creep()),
         modes=Modes.of_numbers([[values[x] for x in names] for names in modes_of(values)]),
-        bulk_ratio=values['bulk_ratio'], **{x: values[x] for x in FACTORS})
+        bulk_ratio=values['bulk_ratio'], thermal=values.get('thermal', Thermal()),
+        **{x: values[x] for x in FACTORS})
 
 
 def flow_of(values: Mapping[str, Any], free: Iterable[str]) -> Flow:

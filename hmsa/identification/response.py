@@ -17,6 +17,7 @@ from hmsa.model.creep import Creep
 from hmsa.model.equations import Array
 from hmsa.model.law import KIND, pack
 from hmsa.model.laws.record import Elastic, GENT
+from hmsa.model.thermal import Thermal
 from hmsa.model.units import MU_0
 from hmsa.motion import SPEED
 from hmsa.motion import theta as places
@@ -32,6 +33,11 @@ _SENSOR = ('stretch_bias', 'stretch_gain', 'sensor_latency')
 _LINEAR = {
     'shear_modulus': places.STIFFNESS, 'damping_coefficient': places.DAMPING,
     'remanence': places.DRIVE, 'constant_force': places.FORCE}
+# By coefficient of the temperature: the value of theta that changes, and the power of it; a lag
+# is L/R.
+_WARMING = {
+    'shear_modulus': (places.STIFFNESS, 1), 'damping_coefficient': (places.DAMPING, 1),
+    'remanence': (places.DRIVE, 1), 'coil_resistance': (places.LAG, -1)}
 # Parameters that are values of theta, by index.
 _PLACES = {
     'coil_time_constant': places.LAG, 'initial_stretch': places.STRETCH,
@@ -82,12 +88,15 @@ def _chain(
     else:
         theta[places.FIRST_BRANCH + places.FLOW:first:places.BRANCH] = quantities.flow_of(
             values, free).kind
-    per_density = {i: -float(theta[i]) / density for i in by_value}
+    warming = _warmed(values, theta, by_value)
+    per_density = {i: -float(theta[i]) / density for i in _LINEAR.values()}
     aside = differenced(values, free)
     chain: dict[str, dict[int, float]] = {}
     for name in free:
-        if name in own:
-            chain[name] = {own[name]: 1.0}
+        if name == quantities.TEMPERATURE:
+            chain[name] = warming
+        elif name in own:
+            chain[name] = {own[name]: by_value.get(own[name], 1.0)}
         elif name in _PLACES:
             chain[name] = {}  # of a branch that is not there
         elif name in _LINEAR:
@@ -110,6 +119,25 @@ def _chain(
             chain[name] = {places.CONSTANT + constant.place + 2 * i: (
                 1.0 / values['shear_modulus'] if constant.unit == 'Pa' else 1.0)}
     return theta, chain
+
+
+def _warmed(
+        values: Mapping[str, Any], theta: Array, by_value: dict[int, float]) -> dict[int, float]:
+    """
+    Scale theta and its derivatives by the values to the temperature.
+
+    Return the derivatives by the temperature; none without coefficients.
+    """
+    thermal: Thermal | None = values.get('thermal')
+    if not thermal:
+        return {}
+    by_temperature = {}
+    for name, (i, power) in _WARMING.items():
+        factor = thermal.factor(name, values[quantities.TEMPERATURE])
+        theta[i] *= factor ** power
+        by_value[i] = by_value.get(i, 1.0) * factor ** power
+        by_temperature[i] = power * float(theta[i]) * getattr(thermal, name) / factor
+    return by_temperature
 
 
 def differenced(values: Mapping[str, Any], free: Sequence[str]) -> tuple[str, ...]:

@@ -67,6 +67,11 @@ class Planner(RunningPlan):
         """Options of the next request."""
         return self.model.options
 
+    @property
+    def base(self) -> JointModel:
+        """The model at the reference of its temperature coefficients."""
+        return self.model if self.warmth is None else self.warmth.base
+
     def set_options(
             self, options: Options, actuator: ActuatorParameters | None = None) -> None:
         """Plan the next requests with other options or for another block, after checks."""
@@ -78,9 +83,8 @@ class Planner(RunningPlan):
 
         Raise `BadInputError` if it cannot, or if its position is another quantity.
         """
-        known = self.model if self.warmth is None else self.warmth.base
-        if (options, actuator) == (known.options, known.actuator):
-            return known
+        if (options, actuator) == (self.base.options, self.base.actuator):
+            return self.base
         was, made = self.model.actuator.coordinate.plural, actuator.coordinate.plural
         if was != made:
             raise BadInputError(
@@ -114,14 +118,16 @@ class Planner(RunningPlan):
 
     # -- temperature ---------------------------------------------------------------------------
 
-    def take_temperature(self, temperature: float, time: int) -> None:
+    def take_temperature(self, temperature: float, time: int, *, estimated: bool = False) -> None:
         """
-        Plan the next requests for a temperature in degrees Celsius, measured at a time in ns.
+        Plan the next requests for a temperature in degrees Celsius at a time in ns.
 
-        Raise `BadInputError` if the model has no parameters there.
+        It is measured, or ``estimated`` from the motion. Raise `BadInputError` if the model has no
+        parameters there.
         """
         if self.warmth is not None:
-            found = self.warmth.measured(temperature, self._levels_until(time), time)
+            found = self.warmth.shown(
+                temperature, self._levels_until(time), time, estimated=estimated)
             # Drafts under way were made for nearly this temperature, and stay valid.
             self.model, self.warmth = found.model(self.model), found
 
@@ -161,8 +167,8 @@ class Planner(RunningPlan):
     def clock_set(self, by: int) -> None:
         """Shift the plan by the ns that the clock was set ahead."""
         super().clock_set(by)
-        if self.warmth is not None and self.warmth.time is not None:
-            self.warmth = replace(self.warmth, time=self.warmth.time + by)
+        if self.warmth is not None:
+            self.warmth = self.warmth.shifted(by)
 
     def take(self, draft: Draft | None, now: int) -> Timeline:
         """Replace the plan from the start of a draft of this revision on; return the plan."""

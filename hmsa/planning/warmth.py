@@ -22,6 +22,9 @@ class Warmth:
     temperature: float
     time: int | None  #: in ns; None before the first one
     ambient: float  #: temperature without a field
+    #: The newest measurement: time in ns and temperature; None if there is none.
+    measured: tuple[int, float] | None = None
+    estimated: bool = False  #: whether it was estimated from the motion since
 
     @classmethod
     def of(cls, base: JointModel) -> 'Warmth':
@@ -53,14 +56,23 @@ class Warmth:
             found = found.after(level.flux_density, following.stamp)
         return found.after(levels[-1].flux_density, time)
 
-    def measured(
-            self, temperature: float, levels: Sequence[PlannedLevel], time: int) -> 'Warmth':
-        """Return it with a temperature that was measured at a time in ns, under some levels."""
+    def shown(
+            self, temperature: float, levels: Sequence[PlannedLevel], time: int, *,
+            estimated: bool = False) -> 'Warmth':
+        """Return it with a temperature that a time in ns has shown, under some levels."""
         foreseen = self.along(levels, time)
         # What the warming by the coil does not explain is the temperature without it.
         return replace(
-            foreseen, temperature=temperature,
+            foreseen, temperature=temperature, estimated=estimated,
+            measured=foreseen.measured if estimated else (time, temperature),
             ambient=foreseen.ambient + temperature - foreseen.temperature)
+
+    def shifted(self, by: int) -> 'Warmth':
+        """Return it with its times shifted by some ns."""
+        return replace(
+            self, time=None if self.time is None else self.time + by,
+            measured=None if self.measured is None else (
+                self.measured[0] + by, self.measured[1]))
 
     def drift(self, model: JointModel) -> float:
         """Return by how much the level that holds a stretch differs from that of a model."""

@@ -10,6 +10,7 @@ import numpy as np
 
 from hmsa.errors import HmsaError
 from hmsa.identification.known import Known
+from hmsa.identification.quantities import TEMPERATURE
 from hmsa.judge.records import SensorModel
 from hmsa.judge.setpoint_samples import SetpointSamples
 from hmsa.model.equations import equilibrium_stretch
@@ -65,6 +66,8 @@ _AGAIN, _BIAS, _ALIKE, _SURE, _MOST = 3e-3, 2e-4, 1e-3, 2.0, 1e-3
 _JUMPED = 5.0
 # Number of samples kept to be explained anew.
 _KEPT = 600
+# Difference in K of an estimated temperature that plans follow; 2e-4 of a level.
+_WARMER = 0.05
 # Fraction by which the report of an applied level may be rounded.
 _ROUNDED = 0.01
 
@@ -121,6 +124,7 @@ class AdaptiveJoint:
     _setpoint: tuple[int, int] = (0, -1)  # number of the plan, and place under way
     _sensor: tuple[StateEstimate, SensorModel] | None = None  # estimate, and its sensor
     _measured: bool = False  # whether the field is measured
+    _thermometer: tuple[int, float] | None = None  # the newest temperature in use
     _differs: int | None = None  # timestamp since which the field differs; None if it does not
     sensor_changed: bool = False  # whether the estimator allows for any bias and gain
     _changed: int = 0  # time at which a move has shown that it has; 0 if none has
@@ -281,6 +285,10 @@ class AdaptiveJoint:
         plan = self.planner.plan
         self.fresh = False
         self._take_levels(max(now, self.newest))
+        warmth = self.planner.warmth
+        if warmth is not None and warmth.measured not in (None, self._thermometer):
+            self._thermometer = warmth.measured
+            self.estimator.measured_temperature(warmth.measured[1])
         before = self.estimator.screening.lost
         estimator, found = yield from doing(_updated, self.estimator, now)
         estimator.learning, self.estimator = self.estimator.learning, estimator
@@ -318,6 +326,17 @@ class AdaptiveJoint:
         if found is not None and trust.why:
             found = replace(found, trusted=False, trouble=trust.why)
         self.latest, self.news = found, True
+        if self.adapts and self.acting is not None:
+            self._take_temperature(self.acting.values[TEMPERATURE], now)
+
+    def _take_temperature(self, celsius: float, now: int) -> None:
+        """Plan for an estimated temperature, unless there is a newer measurement."""
+        warmth = self.planner.foreseen(now)
+        if warmth is None or warmth.measured is not None and (
+                now - warmth.measured[0] <= self.settings.temperature_max_age):
+            return
+        if abs(celsius - warmth.temperature) > _WARMER:
+            self.planner.take_temperature(celsius, now, estimated=True)
 
     def _restart(self, since: int, *, healthy: bool = False) -> None:
         """
@@ -345,6 +364,8 @@ class AdaptiveJoint:
             since = self.newest + 1
         self._tried.add(self.sensor_changed)
         self._since = since
+        if (warmth := self.planner.warmth) is not None:
+            prior = prior.at_temperature(warmth.temperature)
         # The level that has held the block may not have been the one commanded.
         self.estimator.restart(prior, settled=not self._anew)
         self.trust.restarted(screening.rejected, since)
@@ -364,7 +385,7 @@ class AdaptiveJoint:
                 # Samples need neither what was learnt nor another sensor.
                 trust.recover(given=True)
                 self.used = self.given
-                self.reverts = not same_parameters(self.given, self.planner.model)
+                self.reverts = not same_parameters(self.given, self.planner.base)
                 self.planner.take_model(self.given)
             elif anew:
                 trust.wait(now)
@@ -375,7 +396,7 @@ class AdaptiveJoint:
                 self._measures_as_before(found)):
             trust.recover(given=False)
             # With that sensor, samples have confirmed what plans use.
-            trust.confirmed = self.planner.model
+            trust.confirmed = self.planner.base
             trust.wait(now)
             self._restart(self.estimator.since, healthy=True)
 
@@ -408,7 +429,7 @@ class AdaptiveJoint:
         """Record that a move planned with a model has arrived."""
         if self.sensor_changed:
             return
-        self.trust.confirm(model, self.ledger.left)
+        self.trust.confirm(self.based(model), self.ledger.left)
         found = self.acting
         if found is not None and not self.trust.failed:
             place = found.free.index('stretch_bias')
@@ -466,9 +487,20 @@ class AdaptiveJoint:
             return self.state(time)
         return self.predicted(time)
 
+    @property
+    def without(self) -> JointModel:
+        """The model of plans without feedback: as given, at the temperature if measured."""
+        warmth = self.planner.warmth
+        return self.given if warmth is None or warmth.measured is None else (
+            self.given.at_temperature(warmth.temperature))
+
+    def based(self, model: JointModel) -> JointModel:
+        """Return a model of the plan at the reference of the given temperature coefficients."""
+        return model.at_temperature(self.given.temperature)
+
     def adapted(self, model: JointModel | None = None) -> bool:
         """Return whether a model, by default that of the plans, uses learnt parameters."""
-        return (model or self.planner.model) != self.given
+        return (model or self.planner.base) != self.given
 
     def initial_state(self, time: int) -> Believed | None:
         """Return the state for `hmsa.planning.planner.Planner` to plan from at a time."""
@@ -525,7 +557,7 @@ class AdaptiveJoint:
 
     def choose(self, latest: StateEstimate, doing: Doing) -> Awaited[None]:
         """Adopt learnt parameters once clearly better, or while a move waits for them."""
-        used, segments = self.used or self.planner.model, self.planner.plan.segments
+        used, segments = self.used or self.planner.base, self.planner.plan.segments
         model, waits = used, latest.time < self.waits
         if differs(used, latest):
             learnt = self.learnt(used)

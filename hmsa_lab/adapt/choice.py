@@ -13,6 +13,8 @@ import math
 import numpy as np
 
 from hmsa.errors import HmsaError
+from hmsa.identification.quantities import TEMPERATURE
+from hmsa.model.thermal import Thermal
 from hmsa.planning.planner import Planner
 from hmsa.planning.timeline import JointModel
 from hmsa_lab.adapt.estimator import StateEstimate
@@ -79,9 +81,10 @@ def _left(
     The values are fractions of the step. None if the move cannot be planned or simulated.
     """
     try:
+        model = model.at_temperature(estimate.values[TEMPERATURE])
         plan = Planner(
-            model.actuator, replace(model.options, lead_time=0, period=0),
-            stretch=start).setpoint(target, 0)
+            replace(model.actuator, thermal=Thermal()),
+            replace(model.options, lead_time=0, period=0), stretch=start).setpoint(target, 0)
     except HmsaError:
         return None
     arrival, holding = plan.segments[-1].arrival, model.flux_density(model.holding(start))

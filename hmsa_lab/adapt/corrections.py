@@ -86,7 +86,8 @@ class Corrections:
     def _slowly(self, joint: AdaptiveJoint, draft: Draft) -> Draft:
         segment, *rest = draft.segments
         estimate = joint.foreseen(draft.begin)
-        joint.moves = Moves(not same_parameters(draft.levels[-1].model, joint.given))
+        joint.moves = Moves(not same_parameters(
+            joint.based(draft.levels[-1].model), joint.given))
         joint.next_update = joint.next_sample = joint.waits = 0
         # An amplifier that saturated may not do so any more.
         joint.largest = math.inf
@@ -148,8 +149,9 @@ class Corrections:
         if estimate is None or ahead is None:
             return None
         model = learnt_model(
-            planner.model, estimate, planner.plan.segments[-1].stretch, _CREEPS)
-        model = as_of_path(model, planner.model, estimate)
+            planner.base, estimate, planner.plan.segments[-1].stretch, _CREEPS)
+        model = as_of_path(model, planner.base, estimate).at_temperature(
+            planner.model.temperature)
         state = initial_state(estimate, creeps=bool(model.actuator.creep))
 
         def adopt(draft: Draft | None) -> Draft | None:
@@ -191,7 +193,7 @@ class Corrections:
         joint.moves.expected, joint.after = joint.after, 0.0
         if draft.segments[0].path is not None:
             # A stop of the path uses its corrected model too.
-            joint.used = draft.levels[0].model
+            joint.used = joint.based(draft.levels[0].model)
             joint.planner.take_model(joint.used)
         return Verdict(Severity.OK, Code.CORRECTED, f'corrected from samples: {words}')
 
@@ -262,7 +264,7 @@ def _outdated(joint: AdaptiveJoint, now: int) -> int:
     place = plan.under_way(soonest) + 1
     return place if 0 < place < len(plan.segments) and joint.shown(now) and (
         plan.segments[place].since > soonest) and not same_parameters(
-            plan.levels[-1].model, planner.model) else 0
+            joint.based(plan.levels[-1].model), planner.base) else 0
 
 
 def _later(joint: AdaptiveJoint, now: int) -> Replanning | None:
@@ -336,7 +338,7 @@ def _nearer(
     span = 0.0 if path is None else float(np.ptp(path.course(path.breaks)[0]))
     return worthwhile(
         before, after, max(_GAIN * span, _NOISE * estimate.noise), little=0.0,
-        share=SHARE if joint.adapted(plan.level(estimate.time).model) else CLEARLY)
+        share=SHARE if joint.adapted(joint.based(plan.level(estimate.time).model)) else CLEARLY)
 
 
 def _drafted(draft: Draft, plan: Timeline) -> CandidateLevels:

@@ -1,7 +1,7 @@
 """Estimator of an actuator: samples in, state and parameters out."""
 
 from bisect import bisect_left, bisect_right
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 import itertools
 import math
@@ -17,7 +17,8 @@ from hmsa.identification.quantities import (
     complete,
     coordinates,
     derivative,
-    QUANTITIES,
+    quantity_of,
+    TEMPERATURE,
     values_at,
 )
 from hmsa.model.creep import Creep
@@ -40,6 +41,11 @@ _NOISE_GAIN = 0.05
 # Maximum deviation of an estimate from the prior, and drift of a parameter in a second, relative
 # to the spread of the prior.
 _BOUND, _DRIFT = 4.0, 0.003
+# The same where the temperature is estimated.
+_SLOWER = 0.1 * _DRIFT
+# Drift of the temperature in K in a second, deviation of a measured one, and duration in s at rest
+# in which it counts as constant (`hmsa_studies.warming`).
+_WARMS, _MEASURED, _CONSTANT = 0.2, 0.3, 0.5
 # Fraction of this maximum above which an estimate is not trusted, except for uncertain parameters.
 _STRANGE, _FREELY = 0.98, ('damping_coefficient', 'viscoelastic_time')
 # Factor on a variance that keeps a parameter fixed.
@@ -300,10 +306,23 @@ class Estimator:
             return self.prior
         known, prior = self._fixed, self.prior
         if known is None:
-            gone = min(_DRIFT ** 2 * max(self._seconds(time), 0.0), 1.0)
-            known = found.covariance[:-2, :-2] + np.diag(gone * prior.spread ** 2)
+            known = found.covariance[:-2, :-2] + np.diag(self._drift(self._seconds(time)))
         values = {x: y for x, y in found.here.values.items() if x != 'behind'}
         return replace(prior, values=values, covariance=known)
+
+    def _drift(self, duration: float) -> Array:
+        """Return the variance that parameters gain in some seconds, at most their spread's."""
+        spread, free = self.prior.spread, self.prior.free
+        # A change within minutes is one of the temperature, if that changes parameters.
+        rates = np.where([x == TEMPERATURE for x in free], _WARMS, spread * (
+            _SLOWER if TEMPERATURE in free else _DRIFT))
+        return np.asarray(np.minimum(rates ** 2 * max(duration, 0.0), spread ** 2))
+
+    def measured_temperature(self, celsius: float) -> None:
+        """Take a measured temperature of the block into account."""
+        if self._window is not None and TEMPERATURE in self.prior.free:
+            self._window.observe(
+                self.prior.free.index(TEMPERATURE), celsius, _MEASURED ** 2)
 
     def _new_window(self, stamp: int, shown: float, prior: Prior | None = None) -> Window:
         """Return a window at the equilibrium of the present level, else at the reading."""
@@ -314,7 +333,7 @@ class Estimator:
         mean = coordinates(prior.values, prior.free)
         self._fixed = None if self.learning else prior.covariance
         known = prior.covariance * (1.0 if self.learning else _FIXED)
-        level = self._levels[bisect_right(self._levels, stamp, key=lambda x: x[0]) - 1][1]
+        level = self._level(stamp)
         at = rest(prior.values, prior.free, level)
         stretch, frequency = at[:2] if at else (shown, 1.0 / prior.values['time_unit'])
         rests = at is not None and self._settled and self._unchanged(stamp, stamp, _SETTLED)
@@ -413,6 +432,9 @@ class Estimator:
             place = int((1.0 - _KEPT) * count)
         elif count == 0 and until - window.begin > span:
             place = 0
+        elif count and TEMPERATURE in self.prior.free and self._rests(float(window.time[-1])):
+            # Its equilibrium follows the temperature.
+            place = count - 1
         elif self.learning is not (self._fixed is None):
             place = max(count - 1, 0)
         else:
@@ -423,7 +445,8 @@ class Estimator:
         # Vibration decays to nothing, and an exact state has no covariance.
         drift[-2:] = _AT_REST ** 2, (_AT_REST / here.values['time_unit']) ** 2
         if self._fixed is None:
-            drift[:-2] = _DRIFT ** 2 * (time - window.begin) * self.prior.spread ** 2
+            drift[:-2] = self._drift(time - window.begin)
+        drift = self._with_rest(np.diag(drift), here.values, time)
         shift = round(time * NANOSECONDS)
         seconds = shift / NANOSECONDS
         # Later motion shows how equilibrium depends on parameters.
@@ -450,6 +473,29 @@ class Estimator:
         first = bisect_right(self._levels, self._origin, key=lambda x: x[0]) - 1
         # The field of a lagging coil depends on a few levels more.
         del self._levels[:max(first - 8, 0)]
+
+    def _rests(self, until: float) -> bool:
+        """Return whether the window until a time in s is long, and at rest by then."""
+        begun = self._window.begin if self._window is not None else until
+        calm = _SETTLED * self.prior.values['time_unit']
+        return until - begun > _CONSTANT and all(
+            self._seconds(x) < until - calm for x in self._moves(until))
+
+    def _with_rest(self, drift: Array, values: Mapping[str, Any], time: float) -> Array:
+        """Return a drift where the equilibrium at a time in s follows the temperature."""
+        if TEMPERATURE not in self.prior.free:
+            return drift
+        level = self._level(self._origin + round(time * NANOSECONDS))
+        at = rest(values, self.prior.free, level)
+        if at is None:
+            return drift
+        place, follows = self.prior.free.index(TEMPERATURE), np.eye(len(drift))
+        follows[-2, place] = at[2][place]
+        return np.asarray(follows @ drift @ follows.T)
+
+    def _level(self, stamp: int) -> float:
+        """Return the level in T at a timestamp in ns."""
+        return self._levels[max(bisect_right(self._levels, stamp, key=lambda x: x[0]) - 1, 0)][1]
 
     def _fix(self, window: Window, found: Solution) -> None:
         """Fix the parameters of a window, or release them."""
@@ -481,12 +527,15 @@ class Estimator:
     def _move_begins(self, until: float) -> int:
         """Return the time in ns, until one in s, of the last change after a long calm."""
         calm = round(_CALM * self.prior.values['time_unit'] * NANOSECONDS)
-        most = max((abs(x) for _, x in self._levels), default=0.0)
-        changes = [y[0] for x, y in itertools.pairwise(self._levels)
-                   if abs(x[1] - y[1]) > _CORRECTS * most and self._seconds(y[0]) <= until]
         return max((
-            y for x, y in itertools.pairwise([-10**19, *changes]) if y - x > calm),
+            y for x, y in itertools.pairwise([-10**19, *self._moves(until)]) if y - x > calm),
             default=self._origin)
+
+    def _moves(self, until: float) -> list[int]:
+        """Return the times in ns, until one in s, of changes of level that are no corrections."""
+        most = max((abs(x) for _, x in self._levels), default=0.0)
+        return [y[0] for x, y in itertools.pairwise(self._levels)
+                if abs(x[1] - y[1]) > _CORRECTS * most and self._seconds(y[0]) <= until]
 
     def _as_levels(self) -> Levels:
         return Levels(
@@ -499,8 +548,8 @@ def _bounds(prior: Prior) -> Array:
     mean = coordinates(prior.values, prior.free)
     bounds: Array = np.stack([mean - _BOUND * prior.spread, mean + _BOUND * prior.spread], axis=1)
     for i, name in enumerate(prior.free):
-        if QUANTITIES[name].scale == 'linear':
-            bounds[i, 0] = max(bounds[i, 0], QUANTITIES[name].least)
-        elif QUANTITIES[name].scale == 'inverse':
+        if quantity_of(name).scale == 'linear':
+            bounds[i, 0] = max(bounds[i, 0], quantity_of(name).least)
+        elif quantity_of(name).scale == 'inverse':
             bounds[i, 0] = max(bounds[i, 0], 0.2 * mean[i])
     return bounds

@@ -58,7 +58,7 @@ class Feedback(Follower):
         self._reverted: list[AdaptiveJoint] = []  # joints whose plans are to be reverted
         for name, planner in group.planners.items():
             planner.believed = partial(self._believed, name)
-        self._begin({name: x.model for name, x in group.planners.items()})
+        self._begin({name: x.base for name, x in group.planners.items()})
 
     @property
     def on(self) -> bool:
@@ -260,7 +260,8 @@ class Feedback(Follower):
             # With a failing sensor, nothing can be concluded about the move.
             return
         plan = joint.planner.plan
-        why = yield from joint.ledger.take(hold, plan, joint.given, joint.moves, joint.sensor)
+        why = yield from joint.ledger.take(
+            hold, plan, joint.without, joint.moves, joint.sensor)
         if not why:
             joint.confirm(plan.levels[-1].model)
             return
@@ -286,7 +287,7 @@ class Feedback(Follower):
             latest = joint.acting
             if latest is None:
                 joint.used = joint.learnt(joint.given)
-                if not same_parameters(joint.used, joint.planner.model):
+                if not same_parameters(joint.used, joint.planner.base):
                     joint.planner.take_model(joint.used)
             elif joint.may_choose(latest):
                 joint.choosing = joint.choose(latest, self.doing)

@@ -12,7 +12,13 @@ from hmsa.errors import BadInputError
 from hmsa.files import write_text, yaml_text
 from hmsa.identification.files import known_lines
 from hmsa.identification.known import Known
-from hmsa.identification.quantities import BRANCHES, derivative, QUANTITIES, values_of
+from hmsa.identification.quantities import (
+    BRANCHES,
+    derivative,
+    quantity_of,
+    TEMPERATURE,
+    values_of,
+)
 from hmsa.interfaces.actuator import parameters_of
 from hmsa.judge.records import SensorModel
 from hmsa.model.laws.coordinate import coordinate_of
@@ -146,7 +152,7 @@ def known_of(estimate: StateEstimate) -> Known:
     """Return the uncertainty of the parameters of an estimate."""
     # A suspected parameter that is not in use has no standard deviation.
     places = [i for i, x in enumerate(estimate.free)
-              if estimate.deviations[x] > 0.0 and i != estimate.gain]
+              if estimate.deviations[x] > 0.0 and i != estimate.gain and x != TEMPERATURE]
     names = tuple(estimate.free[i] for i in places)
     values = tuple(estimate.values[x] for x in names)
     scale = np.array([derivative(x, y) for x, y in zip(names, values, strict=True)])
@@ -167,7 +173,7 @@ def file_text(estimates: Mapping[str, StateEstimate], now: datetime) -> str:
         for key, value in given.items():
             name = key.rpartition('.')[2]
             note = f'  # standard deviation {estimate.deviations[name]:.3g} ' \
-                f'{QUANTITIES[name].unit}'.rstrip() if name in estimate.free else ''
+                f'{quantity_of(name).unit}'.rstrip() if name in estimate.free else ''
             lines.append(f'    {prefix}{key}: {yaml_text(value)}{note}')
         lines += known_lines(known_of(estimate), prefix)
     return '\n'.join(lines) + '\n'

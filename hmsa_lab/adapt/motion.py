@@ -72,7 +72,7 @@ def follow(
     start = np.zeros(len(wanted))
     start[-2] = 1.0
     starts, heights, slopes = pieces(levels.times, levels.values, levels.slew_limit, begin)
-    lag = values['coil_time_constant']
+    lag = float(theta[places.LAG])
     field, field_lag = float(heights[0]), 0.0
     if lag > 0.0:
         field = levels.field(begin, lag)

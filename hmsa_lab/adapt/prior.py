@@ -14,12 +14,14 @@ from hmsa.identification.quantities import (
     complete,
     derivative,
     QUANTITIES,
+    TEMPERATURE,
     values_of,
 )
 from hmsa.model.equations import Array
 from hmsa.model.laws.coordinate import Coordinate, coordinate_of
 from hmsa.model.modes import Modes
 from hmsa.model.parameters import ActuatorParameters
+from hmsa.model.thermal import BLOCK_COEFFICIENTS
 from hmsa_ros.runtime.records import TRACKED
 
 #: Default standard deviations: of the logarithm for parameters that are estimated by it, else of
@@ -48,6 +50,9 @@ _AS_GIVEN = ('shear_modulus', 'damping_coefficient')
 # do not determine, since they change the stretch at rest and hardly the vibration.
 _CHANGED = {'stretch_bias': 0.1, 'stretch_gain': 0.3}
 _HIDDEN = ('remanence', 'chain_limit', 'constant_force')
+# Deviation in K of the temperature that is given, and the largest for its range, which leaves this
+# fraction of each parameter.
+_GIVEN, _WIDEST, _LEAST_FACTOR = 1.0, 20.0, 0.2
 # Relaxation time of a suspected branch in time scales.
 _RELAXATION = 2.0
 
@@ -105,6 +110,9 @@ class Prior:
         if 'chain_limit' in free:
             values['chain_limit'] = min(values['chain_limit'], 1e9)
         size, given = [], deviations or {}
+        thermal = actuator.thermal
+        steepest = max(abs(getattr(thermal, x)) for x in BLOCK_COEFFICIENTS)
+        values |= {'thermal': thermal, TEMPERATURE: thermal.ambient}
         for name in free:
             deviation = given.get(name, DEVIATIONS[name])
             if name == 'constant_force' and name not in given:
@@ -119,10 +127,15 @@ class Prior:
                 raise BadInputError(
                     f'the deviation of {name} is {deviation:g}: expected a number above 0')
             size.append(deviation)
+        spread = size.copy()
+        if steepest:
+            free = (*free, TEMPERATURE)
+            size.append(_GIVEN)
+            spread.append(min(_WIDEST, 0.25 * (1.0 - _LEAST_FACTOR) / steepest))
         return cls(
-            values, free, np.diag(np.square(size)), np.array(size), tuple(
-                i for i, x in enumerate(free) if i >= named or x in _AS_GIVEN) if suspects else (),
-            named)
+            values, free, np.diag(np.square(size)), np.array(spread), tuple(
+                i for i, x in enumerate(free) if x != TEMPERATURE and (
+                    i >= named or x in _AS_GIVEN)) if suspects else (), named)
 
     @classmethod
     def of_changed_sensor(
@@ -140,6 +153,10 @@ class Prior:
     def coordinate(self) -> Coordinate:
         """Kind of position that samples measure."""
         return coordinate_of(self.values['law'])
+
+    def at_temperature(self, temperature: float) -> 'Prior':
+        """Return the prior of the same block at a temperature in degrees Celsius."""
+        return replace(self, values={**self.values, TEMPERATURE: temperature})
 
     def informed(self, known: Known) -> 'Prior':
         """

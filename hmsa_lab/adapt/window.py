@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmsa.identification.fit import loss, weights_of
-from hmsa.identification.quantities import complete, QUANTITIES, values_at
+from hmsa.identification.quantities import complete, quantity_of, values_at
 from hmsa.identification.response import sensed
 from hmsa.model.equations import Array
 from hmsa.model.laws.coordinate import coordinate_of
@@ -113,6 +113,14 @@ class Rest(NamedTuple):
     weight: float = 0.0  # information in the reading
 
 
+def _observed(
+        mean: Array, covariance: Array, place: int, value: float, variance: float
+) -> tuple[Array, Array]:
+    """Return mean and covariance with an observation of one coordinate."""
+    pull = covariance[place] / (covariance[place, place] + variance)
+    return mean + pull * (value - mean[place]), covariance - np.outer(pull, covariance[place])
+
+
 @dataclass(eq=False)
 class Window:
     """Samples and prior of the horizon; times in s from a common origin."""
@@ -169,19 +177,30 @@ class Window:
             self.mean += share * (known.shown - float(shown[0]) - by @ (self.mean - there))
             self.covariance -= np.outer(share, pull)
 
+    def observe(self, place: int, value: float, variance: float) -> None:
+        """Add an observation of a parameter, by its index, to the prior."""
+        if self.rest is None:
+            self.mean, self.covariance = _observed(
+                self.mean, self.covariance, place, value, variance)
+        else:
+            mean, covariance = _observed(
+                self.rest.mean, self.rest.covariance, place, value, variance)
+            self.rest = self.rest._replace(mean=mean, covariance=covariance)
+
     def rest_on(
             self, at: Rest, count: int, begin: float, here: Simulation, noise: float,
             drift: Array) -> 'Window':
         """Return the window, entirely at rest, without the first samples; as `move_on`."""
         before, weights = at.weight, here.weights[:count]
-        before /= 1.0 + before * float(np.sum(np.square(here.by[:count][-1:]) @ drift))
+        before /= 1.0 + before * float(np.sum(
+            (here.by[:count][-1:] @ drift) * here.by[:count][-1:]))
         weight = before + float(np.sum(weights)) / noise ** 2
         shown = before * at.shown + float(weights @ self.stretch[:count]) / noise ** 2
         return replace(
             self, begin=begin, time=self.time[count:], stretch=self.stretch[count:], weighed=0,
             first=False,
             rest=at._replace(
-                covariance=at.covariance + np.diag(drift[:-2]),
+                covariance=at.covariance + drift[:-2, :-2],
                 shown=shown / weight if weight else 0.0, weight=weight))
 
     def solve(
@@ -325,7 +344,7 @@ class Window:
             self, z: Array, matrix: Array, gradient: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Return the bounded step to the optimum, and which coordinates vary."""
         longest = np.array([
-            _STRIDE if QUANTITIES[x].scale == 'log' else math.inf for x in self.free] + [
+            _STRIDE if quantity_of(x).scale == 'log' else math.inf for x in self.free] + [
                 math.inf] * 2)
         low, high = self._room(z)
         return optimum(
@@ -365,8 +384,8 @@ class Window:
         """
         Return the window without the first samples, which become part of the prior.
 
-        It begins at the next sample, or at the requested time. The drift is the variance that
-        parameters and state gain in between, shape (q,).
+        It begins at the next sample, or at the requested time. The drift is the covariance that
+        parameters and state gain in between, shape (q, q).
         """
         by, weights = here.by[:count], here.weights[:count]
         matrix = self.information + by.T @ (weights[:, None] * by) / noise ** 2
@@ -376,7 +395,7 @@ class Window:
         change = transport(here.motion, count)
         there = np.append(z[:-2], [here.motion.stretch[count], here.motion.rate[count]])
         there = there + change @ (covariance @ gradient)
-        covariance = change @ covariance @ change.T + np.diag(drift)
+        covariance = change @ covariance @ change.T + drift
         return Window(
             self.values, self.free, there,
             0.5 * (covariance + covariance.T), self.bounds, begin,

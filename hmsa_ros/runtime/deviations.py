@@ -120,8 +120,8 @@ class Deviations:
 
     def _limit(self, name: str, least: float, most: float) -> None:
         planner = self._group.planners[name]
-        planner.take_model(replace(planner.model, options=replace(
-            planner.options, flux_density_min=least, flux_density_max=most)))
+        planner.take_model(replace(planner.base, options=replace(
+            planner.base.options, flux_density_min=least, flux_density_max=most)))
 
     # -- commands and their effects -------------------------------------------------------------
 

@@ -76,7 +76,7 @@ class Temperatures:
         now, most = self._clock(), self._settings().temperature_max_age
         for joint in self.joints:
             warmth = self._group.planners[joint].foreseen(now)
-            if warmth is None:
+            if warmth is None or warmth.estimated:
                 continue
             taken = f'plans take {warmth.temperature:.4g} degrees Celsius'
             newest = self._newest.get(joint)
