@@ -19,6 +19,8 @@ from hmsa.model.thermal import Thermal
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Options, Planner
+from hmsa_lab.adapt.motion import follow, Levels
+from hmsa_lab.adapt.prior import Prior
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.runtime.loop import Loop
 from hmsa_ros.runtime.records import (
@@ -29,7 +31,7 @@ from hmsa_ros.runtime.records import (
     StretchRequest,
     Trajectory,
 )
-from hmsa_studies.warming import block, TARGETS, WARMING, warming
+from hmsa_studies.warming import block, DURATION, TARGETS, WARMING, warming
 
 COEFFICIENTS = {'shear_modulus': 3e-3, 'remanence': -1e-3, 'damping_coefficient': -5e-3}
 THERMAL = Thermal(**COEFFICIENTS)
@@ -266,12 +268,40 @@ def test_temperature_that_is_ignored_leaves_vibration_and_offset():
     assert max(x.worst for x in found) > 0.05
 
 
-@pytest.mark.slow
-@pytest.mark.xfail(reason='feedback lags behind a block that warms')
-def test_feedback_without_a_temperature_sensor_is_right_from_the_third_move_on():
-    found = warming('feedback')[2:]
+@pytest.mark.parametrize(('stiffer', 'duration'), [
+    (0.0, 120.0), *(pytest.param(x, DURATION, marks=pytest.mark.slow) for x in (0.0, 0.1))])
+def test_feedback_without_a_temperature_sensor_is_right_from_the_third_move_on(stiffer, duration):
+    found = warming('feedback', stiffer=stiffer, duration=duration)[2:]
     assert max(x.vibration for x in found) < 5e-3
     assert max(x.worst for x in found) < 5e-3
+
+
+@pytest.mark.slow
+def test_feedback_does_not_learn_again_what_a_measured_temperature_explains():
+    found = warming('measured and feedback', stiffer=0.1)[1:]
+    assert max(x.vibration for x in found) < 5e-3
+    assert max(x.worst for x in found) < 5e-3
+    # Of the modulus, 15 K change 5 %.
+    assert abs(found[-1].modulus - 1.0) < 5e-3
+
+
+def test_motion_has_its_derivatives_by_the_temperature():
+    block = replace(paper_actuator(), thermal=replace(THERMAL, coil_resistance=4e-3))
+    prior = Prior.nominal(block, others={'coil_time_constant': 1e-3})
+    levels, times = Levels(np.array([0.0]), np.array([0.03])), np.linspace(0.0, 0.02, 9)
+
+    def motion(celsius):
+        return follow({**prior.values, 'temperature': celsius}, prior.free, (1.01, 0.5), levels,
+                      0.0, times)
+
+    place, (low, here, high) = prior.free.index('temperature'), map(motion, (37.5, 38.0, 38.5))
+    assert here.by[:, place] == pytest.approx(high.stretch - low.stretch, rel=1e-3, abs=1e-9)
+    assert here.rate_by[:, place] == pytest.approx(high.rate - low.rate, rel=1e-3, abs=1e-6)
+    # The same motion as that of the block whose parameters hold there.
+    hot = Prior.nominal(block.at_temperature(38.0), others={
+        'coil_time_constant': block.thermal.coil_time_constant(1e-3, 38.0)})
+    there = follow({**hot.values, 'temperature': 38.0}, (), (1.01, 0.5), levels, 0.0, times)
+    assert here.stretch == pytest.approx(there.stretch, abs=1e-9)
 
 
 # -- identification ------------------------------------------------------------------------------
