@@ -30,8 +30,8 @@ _J_LIM = 5.0
 # Least share of the first mode where another one may have more.
 _STRONG = 0.05
 # Largest deviations in %: of the stretch at rest in units of the step, of the first frequency at
-# rest without a field, and with one.
-_STATIC, _FIRST, _ELSEWHERE = 0.2, 0.5, 6.0
+# any of the stretches.
+_STATIC, _FIRST = 0.2, 0.5
 
 
 def compare(*, quick: bool) -> Sheet:
@@ -43,8 +43,7 @@ def compare(*, quick: bool) -> Sheet:
             static, off = _compared(shape, ratio, cells)
             figures.append({'shape': shape, 'bulk_ratio': ratio, 'static': static, **off})
             free = off['free']
-            passed &= (static <= _STATIC and abs(free[0]) <= _FIRST
-                       and max(map(abs, free)) <= _ELSEWHERE)
+            passed &= static <= _STATIC and max(map(abs, free)) <= _FIRST
             rows.append([
                 f'{shape:g}, {ratio:g}', f'{static:.0e}', f'{off["uniform"][0]:+.1f}',
                 f'{off["constant volume"][0]:+.1f}', *(f'{x:+.2f}' for x in free)])

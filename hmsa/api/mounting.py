@@ -12,7 +12,7 @@ import numpy as np
 
 from hmsa.errors import BadInputError
 from hmsa.interfaces.actuator import actuator_from, along_elastica, parameters_of
-from hmsa.model.continuum import check_mount, clamped, mounted
+from hmsa.model.continuum import check_mount, clamped, mounted, SHAPES, spectrum
 from hmsa.model.equations import critical_zeta, elastic_force, equilibrium_stretch
 from hmsa.model.laws.record import ENDLESS
 from hmsa.model.modes import Modes, MOUNTS
@@ -65,7 +65,7 @@ def _held(block: ActuatorParameters, mount: str, ratio: float | None) -> Actuato
         return replace(
             block, shear_modulus=block.shear_modulus * found.stiffness,
             mass_factor=found.mass_factor, transverse_mass_factor=found.transverse_mass_factor,
-            modes=found.modes)
+            transverse_mass_exponent=found.transverse_mass_exponent, modes=found.modes)
 
     first = made(0.0)
     critical = float(critical_zeta(1.0, first.nondimensional))
@@ -98,39 +98,42 @@ def _facts_of_volume(block: ActuatorParameters) -> list[tuple[str, str]]:
     """Return what a compressible block changes, and what is left if this is ignored."""
     if math.isinf(block.bulk_ratio):
         return []
-    first = replace(block, modes=Modes())
-    ignored = replace(first, bulk_ratio=math.inf)
+    alone = replace(block, modes=Modes())
+    ignored = replace(alone, bulk_ratio=math.inf)
     nu = 0.5 * math.sqrt(block.geometry.transverse)
     load = elastic_force(1.0 + _MOVE, ignored.nondimensional)
     off = 100.0 * (float(equilibrium_stretch(load, block.nondimensional)) - 1.0 - _MOVE) / _MOVE
     side = block.side(1.0 + _MOVE)
-    # Modes contain the inertia of the sides.
-    apart = [] if block.modes else [('sides with own inertia', f'{_apart(block):.5g} Hz')]
     return [
         ("Poisson's ratio", f'{nu:.4g}'),
         (f'side and volume at {1.0 + _MOVE:g}',
          f'{side:.4f} ({ignored.side(1.0 + _MOVE):.4f}) and {(1.0 + _MOVE) * side ** 2:.4f} (1)'),
-        ('with constant volume', f'{1.0 / ignored.period:.5g} Hz'), *apart,
+        ('with constant volume', f'{1.0 / ignored.period:.5g} Hz'), *_first(block),
         ('two_step, constant volume',
-         f'leaves {_left(first, ignored):.2g} % of a step to {1.0 + _MOVE:g}, and rests '
+         f'leaves {_left(alone, ignored):.2g} % of a step to {1.0 + _MOVE:g}, and rests '
          f'{abs(off):.2g} % off')]
 
 
-def _apart(block: ActuatorParameters) -> float:
-    """Return the first frequency in Hz of small uniform motion, with sides that do not follow."""
-    bulk = block.bulk_ratio
-    stiffness = np.array([[bulk + 4.0 / 3.0, 2.0 * bulk - 4.0 / 3.0],
-                          [2.0 * bulk - 4.0 / 3.0, 4.0 * bulk + 4.0 / 3.0]])
-    scale = np.array([block.geometry.inertia_c1 / 6.0, 2.0 / 3.0]) ** -0.5
-    squared = np.linalg.eigvalsh(stiffness * np.outer(scale, scale))
-    return math.sqrt(squared[0]) / (2.0 * math.pi * block.time_unit)
+def _first(block: ActuatorParameters) -> list[tuple[str, str]]:
+    """Return the first frequency of a free block, which does not deform uniformly."""
+    shape = block.half_thickness / block.half_length
+    if block.modes or not SHAPES[0] <= shape <= SHAPES[1]:
+        return []
+    found = spectrum(shape, 'free', bulk_ratio=block.bulk_ratio)
+    unit = block.half_length * math.sqrt(block.density / block.shear_modulus)
+    frequency = float(found.frequencies[found.first]) / (2.0 * math.pi * unit)
+    return [('first mode, mount free',
+             f'{frequency:.5g} Hz; uniform deformation is '
+             f'{100.0 * (1.0 / (frequency * block.period) - 1.0):.2g} % above')]
 
 
 def _facts_of_modes(actuator: ActuatorParameters) -> list[tuple[str, str]]:
     """Return what the modes of a block change."""
     if not actuator.modes:
         return []
-    paper = replace(actuator, mass_factor=1.0, transverse_mass_factor=1.0, modes=Modes())
+    paper = replace(
+        actuator, mass_factor=1.0, transverse_mass_factor=1.0, transverse_mass_exponent=0.0,
+        modes=Modes())
     left, tuned, modal = (_left(actuator, *x) for x in (
         (paper,), (replace(actuator, modes=Modes()),), (actuator, 'modal')))
     return [

@@ -107,6 +107,8 @@ MODES = 'modes'
 SECONDARY = tuple(tuple(f'modes.{y}{x}' for y in (
     'frequency_ratio', 'share', 'damping_ratio', 'ratio_exponent', 'share_exponent'))
     for x in _MODE_NUMBERS)
+# Parameter of a compressible block that is never estimated.
+_EXPONENT = 'transverse_mass_exponent'
 #: Factors on the mass.
 FACTORS = ('mass_factor', 'transverse_mass_factor')
 #: Constants of the hyperelastic models, by the name of their parameter.
@@ -240,7 +242,8 @@ def quantity_of(name: str) -> Quantity:
 
     Raise `BadInputError` if there is none with this name.
     """
-    found = QUANTITIES.get(name) or _OF_LAWS.get('.'.join(name.split('.')[:2]))
+    found = QUANTITIES.get(name) or _ONLY_TRACKED.get(name) or _OF_LAWS.get(
+        '.'.join(name.split('.')[:2]))
     if found is None:
         raise BadInputError(
             f'unknown parameter {name!r}: expected some of {", ".join(QUANTITIES)}'
@@ -268,7 +271,8 @@ def values_of(
                 f'{name} is {value:g}: expected a finite number of at least {quantity.least:g}')
     return {name: x.default for name, x in QUANTITIES.items()} | actuator.numbers | {
         'time_unit': actuator.time_unit, 'law': actuator.law, 'initial_stretch': actuator.rest,
-        'bulk_ratio': actuator.bulk_ratio, **actuator.factors, **_modes_of(actuator.modes),
+        'bulk_ratio': actuator.bulk_ratio, _EXPONENT: actuator.transverse_mass_exponent,
+        **actuator.factors, **_modes_of(actuator.modes),
         **others}
 
 
@@ -295,7 +299,7 @@ def actuator_of(values: Mapping[str, Any]) -> ActuatorParameters:
         creep=values.get('creep', Creep()),
         modes=Modes.of_numbers([[values[x] for x in names] for names in modes_of(values)]),
         bulk_ratio=values['bulk_ratio'], thermal=values.get('thermal', Thermal()),
-        **{x: values[x] for x in FACTORS})
+        transverse_mass_exponent=values[_EXPONENT], **{x: values[x] for x in FACTORS})
 
 
 def flow_of(values: Mapping[str, Any], free: Iterable[str]) -> Flow:
@@ -319,7 +323,8 @@ def energy_of(values: Mapping[str, Any]) -> Elastic | None:
     law: Elastic | None = values.get('law')
     if math.isinf(values['bulk_ratio']):
         return law
-    return condensed(law, values['chain_limit'], values['bulk_ratio'])
+    return condensed(
+        law, values['chain_limit'], values['bulk_ratio'], values[_EXPONENT])
 
 
 def modulus_of(law: Elastic | None) -> tuple[str, float]:

@@ -121,6 +121,8 @@ def parameters_of(actuator: ActuatorParameters) -> dict[str, Any]:
         f'actuator.{name}': value for name, value in actuator.factors.items() if value != 1.0}
     if math.isfinite(actuator.bulk_ratio):
         values[BULK_RATIO.name] = actuator.bulk_ratio
+    if actuator.transverse_mass_exponent:
+        values['actuator.transverse_mass_exponent'] = actuator.transverse_mass_exponent
     if actuator.law is None:
         return values
     units = {x.name: x.unit for x in LAWS[actuator.law.law].constants}

@@ -246,6 +246,10 @@ MODES = (
         'Factor on the inertia across the field relative to that along it, at the same inertia at '
         'rest: how the natural frequency changes with the stretch.', '', 1e-3, 1e3),
     ParameterSpec(
+        'actuator.transverse_mass_exponent', 0.0,
+        'Exponent of the inverse stretch by which the inertia across the field of a compressible '
+        'block grows in addition; 0 with bulk_ratio .inf.', '', -10.0, 10.0),
+    ParameterSpec(
         'modes.frequency_ratio', [],
         'Modes: natural frequencies of up to three secondary modes in units of that of the first; '
         "empty for none, as in the paper's model.", '', 1.0, 100.0, items=float),

@@ -13,7 +13,8 @@ that q is in equilibrium at each l, which depends on s alone:
     3 K J (J - 1) = s psi'(s),    l = s J^(1/3),    force dW/dl = s psi'(s)/l
 
 That the block has one degree of freedom means that q follows at once. Then the transverse motion
-adds (2/3) (dq/dl)^2 to the mass, which is l^-3/6 at constant volume (Eq. 7).
+adds (2/3) (dq/dl)^2 to the mass, which is l^-3/6 at constant volume (Eq. 7). In the first mode of
+a free block, whose faces bulge, this is multiplied by a power of l (`hmsa.model.continuum`).
 """
 
 from functools import lru_cache
@@ -41,6 +42,8 @@ Array = NDArray[np.float64]
 #: Range of a finite bulk modulus in units of the shear modulus. Below it, where Poisson's ratio is
 #: 0.125, a foam buckles and has another energy; above, no sensor shows the change of volume.
 BULK_RATIOS = 1.0, 1e6
+#: Largest exponent of the transverse inertia: a cube of K/G 1 needs 8.
+STEEPEST = 10.0
 # Changes of volume and stretches s of the tables. Below a volume of 1/2 the pressure would fall.
 _VOLUMES, _STRETCHES = (0.6, 2.0), (0.1, 10.0)
 # Points of the search for the ends.
@@ -59,7 +62,7 @@ _TO_SERIES: Array = np.linalg.inv(
 _TO_POWERS: Array = np.linalg.inv(np.vander(_NODES, increasing=True)).astype(np.float64)
 
 
-def check(bulk_ratio: float, law: Elastic | None) -> None:
+def check(bulk_ratio: float, law: Elastic | None, exponent: float = 0.0) -> None:
     """Raise `BadInputError` for a finite bulk modulus that no block of a model has."""
     least, most = BULK_RATIOS
     if not least <= bulk_ratio <= most:
@@ -70,10 +73,14 @@ def check(bulk_ratio: float, law: Elastic | None) -> None:
         what = 'a table, whose levels contain the change of volume' if law.family == TABLE else (
             'a beam, whose volume its bending does not change')
         raise BadInputError(f'bulk_ratio is {bulk_ratio:g} for {what}: expected inf')
+    if not abs(exponent) <= STEEPEST:
+        raise BadInputError(
+            f'transverse_mass_exponent is {exponent:g}: expected {-STEEPEST:g} to {STEEPEST:g}')
 
 
 @lru_cache(maxsize=64)
-def condensed(law: Elastic | None, j_lim: float, bulk_ratio: float) -> Elastic:
+def condensed(
+        law: Elastic | None, j_lim: float, bulk_ratio: float, exponent: float = 0.0) -> Elastic:
     """
     Return the elastic energy of a compressible block over its stretch, and its inertia.
 
@@ -85,6 +92,8 @@ def condensed(law: Elastic | None, j_lim: float, bulk_ratio: float) -> Elastic:
         Limiting extensibility of the Gent model; infinite for neo-Hookean.
     bulk_ratio : float
         Bulk over shear modulus, finite, see `check`.
+    exponent : float
+        Exponent of the inverse stretch by which the transverse inertia grows in addition.
 
     Returns
     -------
@@ -93,7 +102,7 @@ def condensed(law: Elastic | None, j_lim: float, bulk_ratio: float) -> Elastic:
         middle, energy there, and the coefficients of force and inertia about it of each piece.
 
     """
-    block = _block(law, j_lim, bulk_ratio)
+    block = _block(law, j_lim, bulk_ratio, exponent)
     starts, ends, values = _pieces(block)
     middles: Array = 0.5 * (starts + ends)
     powers = np.einsum('kn,vpn->vpk', _TO_POWERS, values) / (
@@ -104,7 +113,7 @@ def condensed(law: Elastic | None, j_lim: float, bulk_ratio: float) -> Elastic:
     return Elastic(
         name, CONDENSED, (float(len(rows)), float(ends[-1]), *rows.ravel().tolist()),
         () if law is None else law.given, (float(starts[0]), float(ends[-1])),
-        bulk_ratio=bulk_ratio, isochoric=law)
+        bulk_ratio=bulk_ratio, inertia_exponent=exponent, isochoric=law)
 
 
 def side(stretch: float, law: Elastic | None, j_lim: float, bulk_ratio: float) -> float:
@@ -116,15 +125,16 @@ def side(stretch: float, law: Elastic | None, j_lim: float, bulk_ratio: float) -
 
 
 @lru_cache(maxsize=64)
-def _block(law: Elastic | None, j_lim: float, bulk_ratio: float) -> '_Block':
-    return _Block(pack(0.0, j_lim, 1.0, law), bulk_ratio)
+def _block(
+        law: Elastic | None, j_lim: float, bulk_ratio: float, exponent: float = 0.0) -> '_Block':
+    return _Block(pack(0.0, j_lim, 1.0, law), bulk_ratio, exponent)
 
 
 class _Block:
     """Equilibrium of the transverse stretch of a block, over the stretch s at constant volume."""
 
-    def __init__(self, material: Array, bulk_ratio: float) -> None:
-        self._material, self._bulk = material, bulk_ratio
+    def __init__(self, material: Array, bulk_ratio: float, exponent: float) -> None:
+        self._material, self._bulk, self._exponent = material, bulk_ratio, exponent
         least, most = (3.0 * bulk_ratio * x * (x - 1.0) for x in _VOLUMES)
 
         def holds(s: Array) -> NDArray[np.bool_]:
@@ -190,7 +200,7 @@ class _Block:
             grows < 3.0, s * force, 3.0 * self._bulk * volume * (volume - 1.0)) / stretches
         change = np.sqrt(volume / stretches) / stretches * (
             (grows / 3.0 - 0.5) / (1.0 + grows / 3.0))
-        return np.stack([force, 4.0 * change ** 2])
+        return np.stack([force, 4.0 * change ** 2 * stretches ** -self._exponent])
 
     def energy(self, stretches: Array) -> Array:
         """Return the energy in units of G, 0 at rest."""

@@ -48,12 +48,12 @@ _STRONG = 0.05
 # Secondary modes that are kept, and the maximum ratio of their frequencies. With a third one,
 # `modal` takes longer and leaves as much on finite elements (benchmarks continuum).
 _COUNT, _FASTEST = 2, 5.0
-# Shapes H/L: finite elements confirm 0.1 to 4 (benchmarks continuum), bar theory 10.
-_SHAPES = 0.02, 10.0
+#: Shapes H/L: finite elements confirm 0.1 to 4 (benchmarks continuum), bar theory 10.
+SHAPES = 0.02, 10.0
 # Largest damping ratio of a secondary mode.
 _MOST_DAMPED = 0.95
-# Logarithms between which the transverse factor is sought.
-_LOGS = -9.0, 3.0
+# Logarithms between which the transverse factor is sought, and largest exponent.
+_LOGS, _GRADED = (-9.0, 3.0), compressible.STEEPEST
 # Stretches about which the natural frequency of the first mode determines the transverse factor.
 _STRETCHES = (0.9, 1.1, 1.2)
 # Stretches near rest that determine how the ratios of frequencies change with it.
@@ -90,6 +90,7 @@ class Mounted:
     stiffness: float  #: factor on the shear modulus
     mass_factor: float
     transverse_mass_factor: float
+    transverse_mass_exponent: float  #: 0 for constant volume
     modes: Modes
 
 
@@ -342,10 +343,10 @@ def mounted(
 
     """
     check_mount(mount)
-    if not _SHAPES[0] <= shape <= _SHAPES[1]:
+    if not SHAPES[0] <= shape <= SHAPES[1]:
         raise BadInputError(
-            f'half_thickness/half_length is {shape:g}: expected {_SHAPES[0]:g} to '
-            f'{_SHAPES[1]:g} for mount {mount}')
+            f'half_thickness/half_length is {shape:g}: expected {SHAPES[0]:g} to '
+            f'{SHAPES[1]:g} for mount {mount}')
     found = spectrum(shape, mount, bulk_ratio=bulk_ratio)
     free = mount == 'free'
     # E/(3 G), and the transverse inertia.
@@ -379,8 +380,8 @@ def mounted(
         ratio = float(np.sum(shares[weak]) / np.sum(shares[weak] / ratios[weak]))
         rows.append((ratio, left, BROAD, 0.0, 0.0))
     return Mounted(
-        stiffness, float(factor),
-        _transverse(shape, j_lim, bulk_ratio, frequency, factor) if free else 1.0,
+        stiffness, float(factor), *(
+            _transverse(shape, j_lim, bulk_ratio, frequency, factor) if free else (1.0, 0.0)),
         Modes.of_numbers(rows))
 
 
@@ -447,9 +448,14 @@ def _odds(shares: Array) -> Array:
 
 
 def _transverse(
-        shape: float, j_lim: float, bulk_ratio: float, first: float, factor: float) -> float:
-    """Return the transverse factor that fits the first mode about several stretches best."""
-    from scipy.optimize import minimize_scalar  # slow to import
+        shape: float, j_lim: float, bulk_ratio: float, first: float,
+        factor: float) -> tuple[float, float]:
+    """
+    Return the transverse factor and exponent that fit the first mode about several stretches best.
+
+    The exponent is that of a compressible block, whose inertia is a table.
+    """
+    from scipy.optimize import least_squares, minimize_scalar  # slow to import
 
     c1 = 2.0 * shape ** 2
     wide = Geometry(1.0, shape, bulk_ratio=bulk_ratio).transverse
@@ -463,10 +469,16 @@ def _transverse(
                        else 6.0 * float(law.mass(stretch, material)) - c1)
         wanted.append(stiffness / float(found.frequencies[found.like(first)]) ** 2)
 
-    def off(log: float) -> float:
+    def off(log: float, exponent: float = 0.0) -> Array:
         more = math.exp(log)
-        return sum((math.log(
-            factor * (wide + c1) / (more * wide + c1) * (more * x + c1) / 6.0 / y)) ** 2
-            for x, y in zip(lateral, wanted, strict=True))
+        graded = np.array(lateral) * np.array(_STRETCHES) ** -exponent
+        return np.asarray(np.log(
+            factor * (wide + c1) / (more * wide + c1) * (more * graded + c1) / 6.0 / wanted))
 
-    return math.exp(minimize_scalar(off, bounds=_LOGS, method='bounded').x)
+    log = float(minimize_scalar(
+        lambda x: float(np.sum(off(x) ** 2)), bounds=_LOGS, method='bounded').x)
+    if math.isinf(bulk_ratio):
+        return math.exp(log), 0.0
+    found = least_squares(lambda x: off(*x), [log, 0.0], bounds=([_LOGS[0], -_GRADED], [
+        _LOGS[1], _GRADED]))
+    return math.exp(found.x[0]), float(found.x[1])

@@ -22,8 +22,12 @@ _ZERO_ALLOWED = ('zeta', 'damping_coefficient')
 # Infinite for neo-Hookean, and for a block of constant volume.
 _INFINITE_ALLOWED = ('j_lim', 'chain_limit', 'bulk_ratio')
 _NO_NUMBERS = ('law', 'creep', 'modes', 'thermal')
+# Exponents, which may be negative.
+_ANY_SIGN = ('transverse_mass_exponent',)
 # Factors on the mass, which no recording of one mode can tell from other values.
 _FACTORS = ('mass_factor', 'transverse_mass_factor')
+# Parameters of a compressible block.
+_OF_VOLUME = ('bulk_ratio', 'transverse_mass_exponent')
 # Scales and groups beyond this and its inverse belong to no block, and overflow in the equations.
 _SMALLEST = 1e-100
 
@@ -36,6 +40,8 @@ def _check(record: object) -> None:
             continue
         if not isinstance(value, (int, float)) or isinstance(value, bool):
             raise BadInputError(f'{name} is {value!r}: expected a number')
+        if name in _ANY_SIGN and math.isfinite(value):
+            continue
         zero, endless = name in _ZERO_ALLOWED, name in _INFINITE_ALLOWED
         # Compared first, since an integer may be too large to convert.
         if not (0.0 < value <= sys.float_info.max or zero and value == 0.0
@@ -274,6 +280,9 @@ class ActuatorParameters:
     bulk_ratio : float
         Bulk over shear modulus of a compressible block, 1 to 1e6; default infinite, for constant
         volume.
+    transverse_mass_exponent : float
+        Exponent of the inverse stretch by which the transverse inertia of a compressible block
+        grows in addition, -10 to 10; default 0.
 
     Raises
     ------
@@ -296,6 +305,7 @@ class ActuatorParameters:
     transverse_mass_factor: float = 1.0
     thermal: Thermal = Thermal()
     bulk_ratio: float = math.inf
+    transverse_mass_exponent: float = 0.0
 
     def __post_init__(self) -> None:
         """Check the values, and that they give usable scales."""
@@ -316,7 +326,11 @@ class ActuatorParameters:
         if math.isfinite(self.bulk_ratio):
             from hmsa.model.compressible import check  # as below
 
-            check(self.bulk_ratio, self.law)
+            check(self.bulk_ratio, self.law, self.transverse_mass_exponent)
+        elif self.transverse_mass_exponent:
+            raise BadInputError(
+                f'transverse_mass_exponent is {self.transverse_mass_exponent:g}: expected 0 '
+                'without a finite bulk_ratio')
         for name, exponents in (
                 ('ratio', self.modes.exponents), ('share', self.modes.share_exponents)):
             if any(exponents) and self.rest == 0.0:
@@ -354,12 +368,13 @@ class ActuatorParameters:
         cube = cls(shear_modulus, density, half_length, half_length, remanence,
                    material.j_lim, 0.0)
         law = material.law
-        bulk_ratio = math.inf if law is None else law.bulk_ratio
-        if law is not None and math.isfinite(bulk_ratio):
+        volume: dict[str, Any] = {} if law is None else {
+            'bulk_ratio': law.bulk_ratio, 'transverse_mass_exponent': law.inertia_exponent}
+        if law is not None and math.isfinite(law.bulk_ratio):
             law = law.isochoric
         made = replace(
             cube, half_thickness=half_length * math.sqrt(material.c1 / 2.0), law=law,
-            modes=material.modes, bulk_ratio=bulk_ratio,
+            modes=material.modes, **volume,
             creep=replace(material.creep, times=tuple(
                 x * cube.time_unit for x in material.creep.times)))
         return replace(made, damping_coefficient=material.zeta * made.damping_unit)
@@ -384,7 +399,7 @@ class ActuatorParameters:
         """All numeric values, by name."""
         return {
             x.name: getattr(self, x.name) for x in fields(self)
-            if x.name not in (*_NO_NUMBERS, *_FACTORS, 'bulk_ratio')}
+            if x.name not in (*_NO_NUMBERS, *_FACTORS, *_OF_VOLUME)}
 
     @property
     def factors(self) -> dict[str, float]:
@@ -456,7 +471,8 @@ class ActuatorParameters:
             return self.law
         from hmsa.model.compressible import condensed  # as above
 
-        return condensed(self.law, self.chain_limit, self.bulk_ratio)
+        return condensed(
+            self.law, self.chain_limit, self.bulk_ratio, self.transverse_mass_exponent)
 
     @cached_property
     def nondimensional(self) -> NondimensionalParameters:

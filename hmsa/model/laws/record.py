@@ -62,6 +62,8 @@ class Elastic:
     section: float = 0.0  #: width times thickness of a beam over its length squared; 0 for a block
     #: Bulk over shear modulus; infinite for a block of constant volume.
     bulk_ratio: float = math.inf
+    #: Exponent of the inverse stretch by which its transverse inertia grows in addition.
+    inertia_exponent: float = 0.0
     #: What a compressible block has at constant volume; None for Gent.
     isochoric: 'Elastic | None' = None
 
