@@ -149,9 +149,14 @@ class AdaptiveJoint:
 
     def _as_identified(self, model: JointModel) -> Prior:
         """Return the prior of a model and a sensor as given."""
-        return Prior.nominal(
+        return self._as_warm(Prior.nominal(
             model.actuator, self.settings.feedback_parameters, suspects=True,
-            others=model.others).informed(self._known)
+            others=model.others).informed(self._known))
+
+    def _as_warm(self, prior: Prior) -> Prior:
+        """Return a prior at the temperature that plans take."""
+        warmth = self.planner.warmth
+        return prior if warmth is None else prior.at_temperature(warmth.temperature)
 
     @property
     def unit(self) -> float:
@@ -364,10 +369,8 @@ class AdaptiveJoint:
             since = self.newest + 1
         self._tried.add(self.sensor_changed)
         self._since = since
-        if (warmth := self.planner.warmth) is not None:
-            prior = prior.at_temperature(warmth.temperature)
         # The level that has held the block may not have been the one commanded.
-        self.estimator.restart(prior, settled=not self._anew)
+        self.estimator.restart(self._as_warm(prior), settled=not self._anew)
         self.trust.restarted(screening.rejected, since)
         for stamp, stretch in self._kept:
             if stamp >= since:
