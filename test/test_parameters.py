@@ -43,8 +43,8 @@ DIMENSIONLESS = {
     'smooth_periods', 'stretch_bias', 'stretch_gain', 'stretch_noise', 'viscoelastic.ratio',
     'viscoelastic.exponent', 'viscoelastic.stress',
     'actuator.bulk_ratio', 'actuator.mass_factor', 'actuator.transverse_mass_factor',
-    'actuator.transverse_mass_exponent', 'modes.frequency_ratio', 'modes.share', 'modes.damping_ratio', 'modes.ratio_exponent',
-    'modes.share_exponent',
+    'actuator.transverse_mass_exponent', 'modes.frequency_ratio', 'modes.share',
+    'modes.damping_ratio', 'modes.ratio_exponent', 'modes.share_exponent',
     # Each number of them has its own unit.
     'identification.values', 'identification.covariance',
     'arrival_tolerance', 'feedback_tolerance', 'stretch_tolerance', 'vibration_tolerance',
