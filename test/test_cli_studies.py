@@ -34,6 +34,8 @@ QUICKLY = '--dpi', 50, '--format', 'png'
 def run(capsys, tmp_path, monkeypatch):
     """Return a runner of ``hmsa`` in an empty folder: status, standard output and error."""
     monkeypatch.chdir(tmp_path)
+    for module in ('robustness', 'sweep'):
+        monkeypatch.setattr(f'hmsa_studies.commands.{module}.PATIENCE', math.inf)
 
     def run_words(*words):
         try:
@@ -79,6 +81,15 @@ def test_robustness_prints_a_table_and_names_its_files(run, tmp_path):
     assert {x['shaper'] for x in rows} == {'two_step', 'robust', 'zv'}
     for path in files[1:]:
         assert (tmp_path / path).read_bytes().startswith(PNG if path[-3:] == 'png' else b'%PDF')
+
+
+@pytest.mark.parametrize(('command', 'words'), [
+    ('robustness', ('--move', '1:1.1', '--shapers', 'two_step', '--errors', 0.02, *QUICKLY)),
+    ('sweep', ('--zeta', '0:1:3', '--out', 'a.csv', '--picture', 'a.png'))])
+def test_a_study_that_draws_for_long_says_so(run, monkeypatch, command, words):
+    monkeypatch.setattr(f'hmsa_studies.commands.{command}.PATIENCE', 0.01)
+    status, _, err = run(command, *words)
+    assert (status, 'drawing ...' in err.splitlines()) == (0, True)
 
 
 @pytest.mark.slow

@@ -21,6 +21,7 @@ from typing import Any, TYPE_CHECKING
 
 from hmsa.cli.options import add_command, MATERIAL
 from hmsa.cli.pictures import formats_of, paper_of, picture_options
+from hmsa.cli.progress import PATIENCE, progress
 from hmsa.errors import BadInputError
 from hmsa.report.paper import named, Paper
 from hmsa_studies.commands import chunked
@@ -250,7 +251,8 @@ def _plan_at_once(sweep: 'Sweep', out: Path | None, picture: _SweepPicture) -> i
             counts.update(block.status.tolist())
             advance(block.status.size)
     _report(sweep.size, counts)
-    pictures = picture.draw()
+    with progress('drawing', lines=PATIENCE):
+        pictures = picture.draw()
     if out is not None:
         print(out, *pictures, sep='\n')
     return 0
@@ -271,7 +273,8 @@ def _plan_in_chunks(
 
     def finish(computed: int) -> int:
         _report(sweep.size, folder.merge(table, picture.add))
-        pictures = picture.draw(changed=computed > 0)
+        with progress('drawing', lines=PATIENCE):
+            pictures = picture.draw(changed=computed > 0)
         if table.parent.resolve() != folder.folder and arguments.shard is None:
             shutil.rmtree(folder.folder, ignore_errors=True)
         print(table, *pictures, sep='\n')
