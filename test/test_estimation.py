@@ -264,8 +264,9 @@ def test_a_bias_and_a_constant_force_are_said_to_be_confounded_until_two_targets
         0.03, abs=4.0 * found.deviations['constant_force'])
 
 
-@pytest.mark.parametrize('factor', [0.8, 1.2])
-@pytest.mark.parametrize('force', [0.03, -0.03])
+@pytest.mark.parametrize(('factor', 'force'), [
+    (0.8, 0.03), (1.2, -0.03), *(
+        pytest.param(*x, marks=pytest.mark.slow) for x in ((0.8, -0.03), (1.2, 0.03)))])
 def test_a_force_is_told_from_a_bias_where_another_modulus_was_given(factor, force):
     # It shifts the rest that the first move begins from by another share than was thought.
     block = replace(
@@ -277,7 +278,7 @@ def test_a_force_is_told_from_a_bias_where_another_modulus_was_given(factor, for
     assert found.values['constant_force'] == pytest.approx(force, rel=0.1)
 
 
-@pytest.mark.parametrize('gain', [0.98, 1.02])
+@pytest.mark.parametrize('gain', [0.98, pytest.param(1.02, marks=pytest.mark.slow)])
 def test_a_bias_is_known_no_better_than_the_gain_of_the_sensor_lets_tell_it_from_a_force(gain):
     # The gain is about rest: what it shows of a stretch of 1 is right.
     extras = oracle.Extras(bias=1.0 - gain, force=0.03, gain=gain)
