@@ -6,6 +6,7 @@ The page needs no network and no other file; its content security policy enforce
 
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
+from functools import cache
 import json
 import math
 from pathlib import Path
@@ -90,16 +91,23 @@ def document(
     """Return a self-contained HTML page from a template that places the figures."""
     data = json.dumps(
         [x.to_dict() for x in drawn], separators=(',', ':'), allow_nan=False)
-    pages = jinja2.Environment(
-        loader=jinja2.FileSystemLoader([template.parent, FOLDER]), autoescape=True,
-        trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined)
-    pages.globals |= {'zip': zip, 'numeric': _numeric}
-    return pages.get_template(template.name).render({'figures': drawn} | values | {
+    found = _pages(template.parent).get_template(template.name)
+    return found.render({'figures': drawn} | values | {
         'title': title, 'version': __version__, 'dark': looks.DARK,
         'style': (FOLDER / 'page.css').read_text(encoding='utf-8'),
         'scripts': [(FOLDER / x).read_text(encoding='utf-8') for x in ('figure.js', 'page.js')],
         # In a script, "</" could close it, and "<!--" could keep it open.
         'data': data.replace('<', '\\u003c')})
+
+
+@cache
+def _pages(folder: Path) -> jinja2.Environment:
+    """Return the templates of a folder, beside those of all pages."""
+    pages = jinja2.Environment(
+        loader=jinja2.FileSystemLoader([folder, FOLDER]), autoescape=True,
+        trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined)
+    pages.globals |= {'zip': zip, 'numeric': _numeric}
+    return pages
 
 
 def _numeric(table: Table) -> list[bool]:
