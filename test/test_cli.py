@@ -1,6 +1,7 @@
 """The command line: plan, send, and reactions to bad input."""
 
 import argparse
+from contextlib import redirect_stdout
 import fcntl
 import json
 import os
@@ -272,20 +273,23 @@ def parsers(parser, path='hmsa'):
     return found
 
 
-@pytest.mark.parametrize('path', parsers(build_parser()))
+PARSERS = parsers(build_parser())
+
+
+@pytest.mark.parametrize('path', PARSERS)
 def test_every_help_ends_with_an_example_that_can_be_copied_and_is_understood(path):
-    text = parsers(build_parser())[path].format_help().rstrip()
+    text = PARSERS[path].format_help().rstrip()
     _, found, example = text.partition('\nexample: ')
     assert found
     words = shlex.split(example.replace('\\\n', ' '))
     assert words[:len(path.split())] == path.split()
-    build_parser().parse_args(split_ros_args(words[1:]))
+    PARSERS['hmsa'].parse_args(split_ros_args(words[1:]))
     assert max(map(len, text.splitlines())) <= 100
 
 
 def test_options_of_one_name_mean_one_thing():
     meanings = {}
-    for command in commands_of(build_parser()):
+    for command in commands_of(PARSERS['hmsa']):
         for option in command.options:
             for name in option.names:
                 meanings.setdefault(name, set()).add(option.value)
@@ -303,10 +307,8 @@ def scripts(tmp_path_factory):
     """Return the folder with the scripts of all shells."""
     folder = tmp_path_factory.mktemp('completion')
     for shell in ('bash', 'zsh', 'fish'):
-        with (folder / shell).open('w') as file:
-            subprocess.run(
-                [sys.executable, '-m', 'hmsa_ros', 'completion', shell], cwd=ROOT, stdout=file,
-                check=True)
+        with (folder / shell).open('w') as file, redirect_stdout(file):
+            assert main(['completion', shell]) == 0
     return folder
 
 
@@ -345,7 +347,7 @@ def test_bash_completes_commands_options_and_files(scripts, tmp_path, words, off
 
 
 def test_bash_offers_every_command_and_option_there_is(scripts, tmp_path):
-    for command in commands_of(build_parser()):
+    for command in commands_of(PARSERS['hmsa']):
         offered = complete(scripts, tmp_path, *command.path.split(), '')
         assert {*command.words, *(y for x in command.options for y in x.names)} <= set(offered)
     assert set(SHAPERS) <= set(complete(scripts, tmp_path, 'plan', '--shaper', ''))
@@ -372,7 +374,7 @@ def test_the_tab_key_completes_in_a_real_bash(scripts, tmp_path):
     ('zsh', ['zsh', '-n']), ('fish', ['fish', '--no-execute'])])
 def test_scripts_of_other_shells_are_read_by_them(scripts, shell, check):
     text = (scripts / shell).read_text()
-    for command in commands_of(build_parser()):
+    for command in commands_of(PARSERS['hmsa']):
         assert not command.path or command.path in text
     if shutil.which(shell) is None:
         pytest.skip(f'{shell} is not installed: its script was NOT tried')
