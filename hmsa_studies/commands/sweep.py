@@ -21,7 +21,7 @@ from typing import Any, TYPE_CHECKING
 
 from hmsa.cli.options import add_command, MATERIAL
 from hmsa.cli.pictures import formats_of, paper_of, picture_options
-from hmsa.cli.progress import PATIENCE, progress
+from hmsa.cli.terminal import PATIENCE, progress
 from hmsa.errors import BadInputError
 from hmsa.report.paper import named, Paper
 from hmsa_studies.commands import chunked
