@@ -13,7 +13,7 @@ import yaml
 
 from hmsa.cli import main
 from hmsa.errors import BadInputError
-from hmsa.interfaces.quantities import BY_KEY, DAMPING, number_of, OPTIONAL, QUANTITIES
+from hmsa.interfaces.quantities import BY_KEY, DAMPING, OPTIONAL, QUANTITIES, quantity_of
 from hmsa.model.equations import elastic_force, natural_frequency
 from hmsa.model.parameters import ActuatorParameters, NondimensionalParameters, paper_actuator
 from hmsa.model.simulation import simulate
@@ -206,13 +206,13 @@ def test_full_sizes_of_a_block_are_twice_the_half_ones(run, tmp_path, sizes):
     ('20hz', 'Hz', 20.0), ('0.02KHZ', 'Hz', 20.0), ('5 khz', 'Hz', 5e3), ('30KPA', 'Pa', 30e3),
     ('30kpa', 'Pa', 30e3), ('1 t', 'T', 1.0), ('3 OHM', 'ohm', 3.0), ('2MPA', 'Pa', 2e6)])
 def test_units_may_be_in_another_case(text, unit, value):
-    assert number_of(text, unit, 'it') == value
+    assert quantity_of(text, unit, 'it') == value
 
 
 @pytest.mark.parametrize(('text', 'unit'), [('30mpa', 'Pa'), ('1MT', 'T'), ('2 M', 'm')])
 def test_the_prefixes_of_a_million_and_a_thousandth_are_not_confused(text, unit):
     with pytest.raises(BadInputError, match='it has the unit'):
-        number_of(text, unit, 'it')
+        quantity_of(text, unit, 'it')
 
 
 @pytest.mark.parametrize('size', ['length', 'thickness'])

@@ -26,7 +26,7 @@ def node_parameters(custom_data: Mapping[str, str]) -> dict[str, dict[str, str]]
     return result
 
 
-def parameters_of(custom_data: Mapping[str, str], node: str, space: str) -> dict[str, str]:
+def recorded_parameters(custom_data: Mapping[str, str], node: str, space: str) -> dict[str, str]:
     """Return JSON values by parameter of a namespace's node, else of the only such node."""
     nodes = node_parameters(custom_data)
     exact = nodes.get(f'{space.rstrip("/")}/{node}')

@@ -339,7 +339,7 @@ def read_messages(
                 topic, message.log_time, message.publish_time, decode(message.data))
 
 
-def number_of(topic: BagTopic, known: Sequence[BagTopic]) -> int:
+def topic_number(topic: BagTopic, known: Sequence[BagTopic]) -> int:
     """Return the number of a topic among those known, or the next one for a new topic."""
     return next((
         number for number, other in enumerate(known)

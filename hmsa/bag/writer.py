@@ -22,7 +22,7 @@ from hmsa.bag import limits, metadata, qos
 from hmsa.bag.definitions import ROS1
 from hmsa.bag.metadata import BagTopic
 from hmsa.bag.output import Entry, OutputFile, PRESETS
-from hmsa.bag.reader import BagReader, number_of
+from hmsa.bag.reader import BagReader, topic_number
 from hmsa.bag.records import MESSAGE_HEAD
 from hmsa.errors import BadInputError, BagError
 
@@ -156,7 +156,7 @@ class BagWriter:
     def add_topic(self, topic: BagTopic) -> int:
         """Add a topic and return its number; raise `BagError` beyond `MAX_CHANNELS`."""
         topic.check()
-        number = number_of(topic, self._topics)
+        number = topic_number(topic, self._topics)
         if number < len(self._topics):
             # All files contain the first profiles.
             if set(topic.profiles) - set(self._topics[number].profiles):

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 from hmsa.bag.metadata import BagTopic
 from hmsa.bag.output import Entry
-from hmsa.bag.reader import number_of
+from hmsa.bag.reader import topic_number
 from hmsa.bag.writer import BagWriter, MIN_FILE_SIZE
 from hmsa.errors import BadInputError, BagError
 
@@ -134,7 +134,7 @@ class WriterThread:
         """Add a topic, or new profiles of a known one; return its number for the messages."""
         topic.check()
         with self._condition:
-            number = number_of(topic, self._topics)
+            number = topic_number(topic, self._topics)
             if number == len(self._topics):
                 self._topics.append(topic)
             self._ask(partial(self._writer.add_topic, topic))

@@ -20,7 +20,7 @@ from hmsa.cli.options import add_command, JSON, of_unit, show, temperature_optio
 from hmsa.cli.terminal import progress
 from hmsa.errors import BadInputError, meant
 from hmsa.files import check_targets, may_be_bag, write_text
-from hmsa.interfaces.quantities import number_of
+from hmsa.interfaces.quantities import quantity_of
 
 if TYPE_CHECKING:
     from hmsa.identification.files import Belief
@@ -144,11 +144,11 @@ def known_of(text: str) -> tuple[dict[str, float], dict[str, float]]:
                 f'{", ".join(QUANTITIES)}' + (meant(name, QUANTITIES) if equals else ''))
         unit = QUANTITIES[name].unit
         value, known, std = (x.strip() for x in rest.partition('+-'))
-        values[name] = number_of(value, unit, name)
+        values[name] = quantity_of(value, unit, name)
         if std.endswith('%'):
-            deviations[name] = 0.01 * abs(values[name]) * number_of(std[:-1], '', name)
+            deviations[name] = 0.01 * abs(values[name]) * quantity_of(std[:-1], '', name)
         elif known:
-            deviations[name] = number_of(std, unit, name)
+            deviations[name] = quantity_of(std, unit, name)
     return values, deviations
 
 

@@ -41,7 +41,7 @@ LAW_OPTION: Row = (
 
 def law_of(text: str) -> tuple[str, dict[str, Any]]:
     """Return name and constants of `LAW_OPTION`; raise `BadInputError` if invalid."""
-    from hmsa.interfaces.quantities import number_of
+    from hmsa.interfaces.quantities import quantity_of
     from hmsa.model.laws import LAWS
 
     name, _, rest = text.partition(':')
@@ -58,7 +58,7 @@ def law_of(text: str) -> tuple[str, dict[str, Any]]:
                 f'{", ".join(known) or "none, since it has no constants"}')
         kind, unit = known[key].kind, known[key].unit
         constants[key] = value if kind is str else [
-            number_of(x, unit, key) for x in value.split('/')] if kind is list else number_of(
+            quantity_of(x, unit, key) for x in value.split('/')] if kind is list else quantity_of(
                 value, unit, key)
     # Other constants, such as those of a beam, are in a parameter file.
     if known and not constants and {x.unit for x in known.values()} <= {'Pa', ''}:
@@ -82,9 +82,9 @@ def argument(read: Callable[[str], T]) -> Callable[[str], T]:
 def of_unit(option: str, unit: str, text: str) -> Row:
     """Return an option for a number above 0, in SI or with another unit."""
     def read(words: str) -> float:
-        from hmsa.interfaces.quantities import number_of
+        from hmsa.interfaces.quantities import quantity_of
 
-        value = number_of(words, unit, option.removeprefix('--').replace('-', ' '))
+        value = quantity_of(words, unit, option.removeprefix('--').replace('-', ' '))
         if not value > 0.0:
             raise BadInputError(f'{value:g} {unit}: expected more than 0 {unit}')
         return value
@@ -95,10 +95,10 @@ def of_unit(option: str, unit: str, text: str) -> Row:
 def temperature_option(text: str) -> Row:
     """Return the option for a temperature in degrees Celsius, with or without the unit."""
     def read(words: str) -> float:
-        from hmsa.interfaces.quantities import number_of
+        from hmsa.interfaces.quantities import quantity_of
         from hmsa.model.thermal import checked_temperature
 
-        return checked_temperature(number_of(words, 'degC', 'temperature'))
+        return checked_temperature(quantity_of(words, 'degC', 'temperature'))
 
     return '--temperature', 'T', argument(read), text
 
@@ -106,9 +106,9 @@ def temperature_option(text: str) -> Row:
 def frequency(option: str, text: str, **settings: Any) -> Row:
     """Return an option for a frequency in Hz or with a unit."""
     def read(words: str) -> float:
-        from hmsa.interfaces.quantities import number_of
+        from hmsa.interfaces.quantities import quantity_of
 
-        return number_of(words, 'Hz', option.removeprefix('--'))
+        return quantity_of(words, 'Hz', option.removeprefix('--'))
 
     return option, 'HZ', argument(read), text, settings
 

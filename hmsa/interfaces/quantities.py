@@ -48,7 +48,7 @@ _REVIEW = 'Wu et al., Multifunctional Materials 3 (2020) 042003'
 _ZHAO = 'Zhao et al., J. Mech. Phys. Solids 124 (2019) 244'
 
 
-def number_of(text: str, unit: str, words: str) -> float:
+def quantity_of(text: str, unit: str, words: str) -> float:
     """
     Read a number with or without a unit, and return it in SI units; ``words`` name it in messages.
 
@@ -105,7 +105,7 @@ class GivenNumber:
 
     def parse(self, text: str) -> float:
         """Read a number in SI or with a unit, ``'10 mm'``; raise `BadInputError` if invalid."""
-        value = number_of(text, self.unit, self.words)
+        value = quantity_of(text, self.unit, self.words)
         if not self.least <= value <= self.largest:
             raise BadInputError(
                 f'{self.words} is {self.show(value)}: expected {self.least:g} to '

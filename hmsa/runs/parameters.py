@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from hmsa.bag.experiment import parameters_of
+from hmsa.bag.experiment import recorded_parameters
 from hmsa.bag.limits import load_yaml
 from hmsa.errors import assume, BadInputError, BagError, excerpt
 from hmsa.files import read_at_most
@@ -34,7 +34,7 @@ def recorded(custom_data: Mapping[str, str], space: str) -> dict[str, object]:
     """Return the parameters of planner and plant in a namespace by ``'node.name'``."""
     parameters: dict[str, object] = {}
     for node in (PLANNER, PLANT):
-        for name, text in parameters_of(custom_data, node, space).items():
+        for name, text in recorded_parameters(custom_data, node, space).items():
             try:
                 parameters[f'{node}.{shared.present_name(name)}'] = json.loads(text)
             except (ValueError, RecursionError):

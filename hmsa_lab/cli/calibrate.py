@@ -19,7 +19,7 @@ from hmsa.cli.pictures import paper_of, picture_options
 from hmsa.cli.terminal import PATIENCE, progress
 from hmsa.errors import BadInputError, HmsaError
 from hmsa.files import check_targets, write_text, yaml_text
-from hmsa.interfaces.quantities import number_of
+from hmsa.interfaces.quantities import quantity_of
 from hmsa_lab.cli.check_driver import settings_of
 
 if TYPE_CHECKING:
@@ -214,7 +214,7 @@ def _typed(current: float) -> float:
     with redirect_stdout(sys.stderr):  # the question is not a result
         while True:
             try:
-                return number_of(
+                return quantity_of(
                     input(f'flux density at {current:.4g} A [T, or with a unit]: '), 'T',
                     'reading')
             except BadInputError as error:

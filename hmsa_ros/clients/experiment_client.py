@@ -13,7 +13,7 @@ from hmsa.interfaces.parameters import BLOCK, WORDS
 from hmsa.interfaces.status import whole
 from hmsa_ros.clients.client import newest_time, PlannerClient
 from hmsa_ros.clients.experiment import Experiment, START_SECONDS
-from hmsa_ros.clients.remote import parameters_of
+from hmsa_ros.clients.remote import remote_parameters
 from hmsa_ros.nodes import ros_entities
 
 # Time limit in s for a sequence to be completed after its duration.
@@ -100,7 +100,7 @@ class ExperimentClient(PlannerClient):
         """
         for name in (topics.PLANNER, topics.PLANT):
             if name == topics.PLANNER or self._experiment.nodes or self._is_there(name):
-                self._parameters |= {f'{name}.{x}': y for x, y in parameters_of(
+                self._parameters |= {f'{name}.{x}': y for x, y in remote_parameters(
                     self, name, each=self._check_nodes).items()}
 
     def parameter(self, name: str) -> object:

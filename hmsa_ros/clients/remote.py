@@ -32,7 +32,7 @@ def _ask(
         each, f'a reply of node {name} in namespace {client.node.get_namespace()}: does it run?')
 
 
-def parameters_of(
+def remote_parameters(
         client: TemporaryNode, name: str, names: Sequence[str] = (),
         each: Callable[[], None] | None = None) -> dict[str, Any]:
     """
@@ -97,8 +97,8 @@ class RemoteNode(TemporaryNode):
         self._name = name
 
     def get(self, names: Sequence[str] = ()) -> dict[str, Any]:
-        """Return parameters by name, by default all of them; see `parameters_of`."""
-        return parameters_of(self, self._name, names)
+        """Return parameters by name, by default all of them; see `remote_parameters`."""
+        return remote_parameters(self, self._name, names)
 
     def set(self, name: str, text: str) -> tuple[Any, Any]:
         """Change a parameter as `set_all` does; return the values before and after."""

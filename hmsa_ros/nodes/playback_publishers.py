@@ -17,9 +17,8 @@ from hmsa.errors import BadInputError, BagError, listed, printable
 from hmsa.interfaces import topics
 from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.cdr import stamp_of
-from hmsa_ros.nodes.qos import publisher
 from hmsa_ros.nodes.ros_entities import interface_class
-from hmsa_ros.nodes.selection import Filter, is_full_name, Selection
+from hmsa_ros.nodes.selection import Filter, is_full_name, publisher_profile, Selection
 from hmsa_ros.nodes.service_call import ServiceCall
 
 #: Limit on the number of publishers, each of which takes 1.5 ms and 35 kB.
@@ -56,7 +55,8 @@ def create_senders(
         try:
             if not reason:
                 result[name] = node.create_publisher(
-                    interface_class(held[name].type), full[name], publisher(held[name].profiles))
+                    interface_class(held[name].type), full[name],
+                    publisher_profile(held[name].profiles))
         except Exception as error:  # an invalid quality of service
             reason = f'it cannot be published ({" ".join(str(error).split())})'
         if reason:
@@ -103,7 +103,7 @@ def _left_out(
 def latched(reader: BagReader, topics: Iterable[str]) -> dict[str, int]:
     """Return the number of messages that a late subscriber receives from each latched topic."""
     profiles = {name: reader.topics[name].profiles for name in topics}
-    return {name: publisher(x).depth for name, x in profiles.items()
+    return {name: publisher_profile(x).depth for name, x in profiles.items()
             if any(profile.durability == 'transient_local' for profile in x)}
 
 

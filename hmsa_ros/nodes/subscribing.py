@@ -13,9 +13,8 @@ from hmsa.bag.writer import BagTopic
 from hmsa.bag.writer_thread import WriterThread
 from hmsa.errors import BagError
 from hmsa_ros.nodes.capture import Capture, RawSubscription
-from hmsa_ros.nodes.qos import stored, subscription
 from hmsa_ros.nodes.ros_entities import interface_class
-from hmsa_ros.nodes.selection import Selection
+from hmsa_ros.nodes.selection import Selection, stored_profile, subscription_profile
 
 # Share of the memory for waiting messages that the queues of the middleware may take: these serve
 # while the recorder gets no processor, its own queue while the disk is slow.
@@ -86,7 +85,7 @@ class Subscriptions:
             known.publishers = count
         if not infos:
             return
-        offered = tuple(sorted((stored(info.qos_profile) for info in infos), key=repr))
+        offered = tuple(sorted((stored_profile(info.qos_profile) for info in infos), key=repr))
         if known is not None and not Counter(offered) - Counter(known.offered):
             return  # no new publisher; one that left changes nothing
         type_name = known.type if known is not None else infos[0].topic_type
@@ -104,7 +103,7 @@ class Subscriptions:
             self._warn(f'topic {name} is not recorded: {error}')
             return
         number = self._recording.add_topic(self._describe(name, type_name, offered, hashes))
-        qos = subscription(offered, self._depth if known is None else known.qos.depth)
+        qos = subscription_profile(offered, self._depth if known is None else known.qos.depth)
         logger = self._node.get_logger()
         if known is None:
             recorded = RecordedTopic(name, type_name, number, qos, offered)
@@ -128,7 +127,7 @@ class Subscriptions:
             depth = max(_MIN_DEPTH, int(share / max(topic.largest, 1)))
             # By half at least, since messages may grow little by little.
             if topic.largest and depth <= topic.qos.depth // 2:
-                self._replace(topic, subscription(topic.offered, depth))
+                self._replace(topic, subscription_profile(topic.offered, depth))
 
     def _replace(self, topic: RecordedTopic, qos: QoSProfile) -> None:
         """Subscribe to a topic again."""
