@@ -3,13 +3,17 @@
 import json
 import re
 import signal
+from types import SimpleNamespace
 
 from mcap.reader import make_reader
 import numpy as np
 import pytest
 
+from hmsa.ending import ENDING
 from hmsa.runs.bags import read_runs
 from hmsa.runs.record import without_repeats
+from hmsa_ros.cli.run import _carried_out
+from hmsa_ros.clients.experiment import Experiment
 
 RUN_SECONDS = 300.0
 SETPOINTS = ('1.10:0.1', '1.20:0.1', '1.00:0.1')
@@ -223,3 +227,15 @@ def test_a_simulated_experiment_never_commands_nodes_that_run_already(start, ros
     assert run.wait(RUN_SECONDS) == 1
     assert 'another planner, plant or driver is running' in run.stderr
     assert not asked
+
+
+def test_the_evaluation_of_a_run_can_be_interrupted(handlers, monkeypatch, tmp_path):
+    experiment = Experiment(tmp_path, ((1.1, 1.0),))
+    monkeypatch.setattr(
+        'hmsa_ros.clients.experiment.conduct', lambda *_: SimpleNamespace(measured=True))
+    monkeypatch.setattr(
+        'hmsa.runs.bags.read_runs', lambda *_, **__: signal.raise_signal(signal.SIGINT))
+    monkeypatch.setattr(ENDING, 'asked', False)
+    ENDING.note()
+    with pytest.raises(KeyboardInterrupt):
+        _carried_out(SimpleNamespace(report=False), experiment, None, lambda *_: None)

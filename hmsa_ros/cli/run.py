@@ -85,7 +85,6 @@ def run(arguments: argparse.Namespace) -> int:
         experiments = [_experiment(arguments, x) for x in folders]
     for x in folders:
         prepare(x)
-    ENDING.note()
     show_notes()
     records, each, whole = [], [], True
     for experiment in experiments:
@@ -127,8 +126,10 @@ def _carried_out(
     """Conduct an experiment, and judge the setpoints of each joint from its bag."""
     from hmsa_ros.clients.experiment import conduct
 
+    ENDING.note()  # since nodes are to be stopped
     done = conduct(experiment, partial(_show, update))
     ENDING.check()
+    ENDING.interrupt()
     if not done.measured:
         return done, [], None
     update('evaluating the bag', None)
