@@ -53,7 +53,7 @@ class JointChannel:
                 self._node, topics.of_joint(topics.TEMPERATURE, self._joint, self._names),
                 self._on_temperature)
 
-    def send(self, command: Send, frame: str) -> None:
+    def publish_command(self, command: Send, frame: str) -> None:
         """Publish a command in the frame of the coil."""
         self._command.publish(
             conversions.to_command(command.stamp, command.flux_density, frame))

@@ -355,7 +355,7 @@ class PlannerNode(ManagedNode):
     def _publish(self, output: records.Output) -> None:
         match output:
             case records.Send():
-                self._channels[output.joint].send(output, self._settings['frame_id'])
+                self._channels[output.joint].publish_command(output, self._settings['frame_id'])
             case records.PlanChanged():
                 self._plan.publish(conversions.to_plan(output.stamps, output.samples))
             case records.StatusChanged():
