@@ -409,7 +409,7 @@ def simulated(*setpoints: tuple[float, float], rate: float) -> Run:
     asked, before = [], block.rest
     for x in plan.segments:
         setpoint = described(block, x.stretch, before, x.since, x.until)
-        asked.append(Outcome(replace(setpoint, arrival=x.arrival)))
+        asked.append(Outcome(setpoint=replace(setpoint, arrival=x.arrival)))
         before = x.stretch
     return Run(
         'run', 'actuator', Path('run'), time, time, *motion,

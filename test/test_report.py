@@ -123,7 +123,8 @@ def outcomes(plan, actuator, *, space='', **more):
     for number, x in enumerate(plan.segments, 1):
         setpoint = described(actuator, x.stretch, start, x.since, x.until)
         told = Outcome(
-            replace(setpoint, number=number, count=count, arrival=x.arrival, held=number == count),
+            setpoint=replace(
+                setpoint, number=number, count=count, arrival=x.arrival, held=number == count),
             plan=1, joint='actuator', moves=((x.begin, x.arrival),),
             decided=x.arrival or x.until, **more)
         messages.append((

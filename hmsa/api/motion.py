@@ -454,7 +454,7 @@ def _outcomes(plan: 'Plan', start: float) -> tuple[Outcome, ...]:
             plan.segments, plan.move_times.tolist(), ends.tolist(), strict=True), 1):
         target, until = segment.setpoint.stretch, (
             round(end * NANOSECONDS) if math.isfinite(end) else None)
-        found.append(Outcome(replace(
+        found.append(Outcome(setpoint=replace(
             described(plan.actuator.block, target, start, begins, until), number=i, count=count,
             held=i == count, arrival=begins + round(duration * NANOSECONDS)
             if math.isfinite(duration) else None)))

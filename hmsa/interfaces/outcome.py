@@ -65,7 +65,7 @@ _ASKED: dict[str, tuple[str, Callable[[str], Any]]] = {
     'decay': ('decay', lambda x: max(_finite(x), 0.0)), 'joint': ('joint', str)}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Outcome:
     """What became of one requested setpoint; times in ns."""
 

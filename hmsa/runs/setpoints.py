@@ -70,7 +70,7 @@ def _held(run: Run, levels: Sequence[RecordedLevel]) -> list[Outcome]:
         begin = i + 1
     joints = run.parameters.get('planner.joints')
     joint = run.joint if isinstance(joints, list) and len(joints) > 1 else ''
-    return [Outcome(replace(
+    return [Outcome(setpoint=replace(
         x, number=i, count=len(found), joint=joint, held=i == len(found)))
         for i, x in enumerate(found, 1)]
 

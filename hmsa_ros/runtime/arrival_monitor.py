@@ -223,12 +223,14 @@ class _Joint:
         asked = self.asked.segments[self.asked.kept + number]
         early = self.until is not None and (
             through or finding is None or setpoint.end is None or setpoint.end > self.until)
+        moves = tuple(self.moves.get(number, [(asked.begin, asked.arrival)]))
         return Outcome(
-            setpoint, _ASKED.get(asked.code, SETPOINT), self.label or '', self.asked.number,
-            self.key, self.plan.levels[0].model.units.coordinate, now, through,
-            tuple(self.moves.get(number, [(asked.begin, asked.arrival)])),
-            not self.needed and len(self.moves.get(number, ())) > 1,
-            self.ended if early else '', self.until if early else None, finding)
+            setpoint=setpoint, asked=_ASKED.get(asked.code, SETPOINT), request=self.label or '',
+            plan=self.asked.number, joint=self.key,
+            coordinate=self.plan.levels[0].model.units.coordinate, decided=now, through=through,
+            moves=moves, corrected=not self.needed and len(moves) > 1,
+            ended=self.ended if early else '', until=self.until if early else None,
+            finding=finding)
 
     def end(self, until: int, ended: str, now: int) -> Iterator[Outcome]:
         """
