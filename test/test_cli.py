@@ -219,6 +219,9 @@ def test_send_moves_several_joints_each_to_its_stretch_or_all_to_one(start, ros)
         send = start.hmsa('send', count, '--joint', names)
         assert send.wait(300.0) == 2
         assert 'expected one for all, or one per joint' in send.stderr
+    send = start.hmsa('send', '1.1:1')
+    assert send.wait(300.0) == 2
+    assert 'names among left, right; name the joints with --joint' in send.stderr
 
 
 @pytest.mark.slow

@@ -243,7 +243,9 @@ class PlannerClient(Link):
             # A planner that has just started may not have received the time yet.
             if verdict is not None and (
                     verdict.code != 'no_time' or monotonic() > deadline):
-                raise BadInputError(f'the planner refused: {verdict.message}')
+                raise BadInputError(
+                    f'the planner refused: {verdict.message}'
+                    + '; name the joints with --joint' * (verdict.code == Code.UNKNOWN_JOINT))
             self._executor.spin_once(timeout_sec=SLICE_SECONDS)
             sleep(SLICE_SECONDS)
 
