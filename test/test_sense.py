@@ -107,3 +107,16 @@ def test_two_poses_become_the_stretch_between_them(ros, start):
     assert sample.header.stamp.sec * 10**9 + sample.header.stamp.nanosec == START - 2 * MS
     # Each timestamp counts once.
     assert len(got) == 1
+
+
+@pytest.mark.ros
+def test_millimetres_without_the_length_at_rest_are_no_stretch(ros, start):
+    kind = interface_class('std_msgs/msg/Float64')
+    publisher = ros.node.create_publisher(kind, 'length', 10)
+    sense = start.hmsa('sense', '--ros-args', '-p', 'topic:=length')
+
+    def said():
+        publisher.publish(kind(data=21.0))
+        return 'as sensor.rest_length' in sense.output
+    ros.spin_until(said, 'the warning')
+    assert 'a reading on /length becomes a stretch of 21: expected at most 10;' in sense.output

@@ -101,6 +101,8 @@ _FIND: dict[str, Callable[[Any, str], tuple[Any, int | None]]] = {
 # Interval in s at which a publisher of unknown type is looked up, and time in ns without a reading
 # after which that is reported.
 _LOOK_SECONDS, _SILENT = 0.2, 2 * NANOSECONDS
+# Largest stretch or deflection of any actuator; beyond it, the length at rest is missing.
+_LARGEST = 10.0
 # A best-effort subscription matches any sensor.
 _QUALITY = topics.Quality(1000, reliable=False)
 
@@ -248,6 +250,11 @@ class SenseNode(ManagedNode):
             if not math.isfinite(stretch):
                 self._useless += 1
                 continue
+            if abs(stretch) > _LARGEST:
+                self.get_logger().warning(
+                    f'a reading on {self._topic} becomes a stretch of {stretch:.4g}: expected at '
+                    f'most {_LARGEST:g}; give the length at rest, in the unit of the readings, as '
+                    'sensor.rest_length', throttle_duration_sec=10.0)
             self._newest = stamp
             if not self.active:
                 continue
