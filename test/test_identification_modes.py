@@ -36,7 +36,7 @@ DWELL = 8.0 * BLOCK.period
 WITH_MODES = (*DEFAULT_FREE, MODES)
 
 
-def levels_of(count=10, targets=TARGETS):
+def levels_of(count=6, targets=TARGETS):
     """Return times in s and levels in T of unshaped steps."""
     times = np.append(0.0, 0.02 + DWELL * np.arange(count))
     levels = BLOCK.flux_density_unit * np.append(0.0, elastic_force(
@@ -44,7 +44,7 @@ def levels_of(count=10, targets=TARGETS):
     return times, levels
 
 
-def recorded(actuator=TRUE, *, noise=1e-3, extras=None, seed=0, count=10) -> Measurement:
+def recorded(actuator=TRUE, *, noise=1e-3, extras=None, seed=0, count=6) -> Measurement:
     """Return a recording of unshaped steps."""
     level_times, levels = levels_of(count)
     times = np.arange(0.0, level_times[-1] + DWELL, 1e-3)
