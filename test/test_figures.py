@@ -308,8 +308,8 @@ def test_a_file_that_cannot_be_written_is_refused_in_one_line(
         name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / name).mkdir()
     assert main(['figures', '--out', str(tmp_path)]) == 2
-    error = capsys.readouterr().err
-    assert error.count('\n') == 1
+    # Figures that take long on a busy machine are named.
+    error, = (x for x in capsys.readouterr().err.splitlines() if not x.endswith(' ...'))
     assert name in error
 
 

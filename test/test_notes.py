@@ -26,15 +26,21 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
+def quick(err):
+    """Return the lines but those of what takes long on a busy machine."""
+    return ''.join(x for x in err.splitlines(keepends=True) if not x.endswith(' ...\n'))
+
+
 @pytest.mark.parametrize('words', COMMANDS.values(), ids=COMMANDS)
 def test_a_command_without_a_file_says_once_that_it_takes_the_example(here, capsys, words):
     assert main([*words, '--json']) == 0
     out, err = capsys.readouterr()
-    assert err.startswith(NOTE)
-    assert err.count('\n') == 1
-    assert err.strip().removeprefix('hmsa: note: ') in json.loads(out)['notes']
+    note = quick(err)
+    assert note.startswith(NOTE)
+    assert note.count('\n') == 1
+    assert note.strip().removeprefix('hmsa: note: ') in json.loads(out)['notes']
     assert main([*words, '--params-file', 'block.yaml']) == 0
-    assert capsys.readouterr().err == ''
+    assert quick(capsys.readouterr().err) == ''
 
 
 def test_bad_input_is_one_line_and_a_refusal_names_the_assumption(here, capsys):
@@ -58,7 +64,7 @@ def test_a_section_for_another_node_is_not_used_and_said(here, capsys):
         'left: {plant: {ros__parameters: {actuator.half_length: 0.02}}}\n', encoding='utf-8')
     for words in (COMMANDS['excite'], ['plan', '1.01:1']):
         assert main([*words, '--params-file', 'it.yaml']) == 0
-        assert capsys.readouterr().err == (
+        assert quick(capsys.readouterr().err) == (
             "hmsa: note: it.yaml: its section '/planr' is not used: expected /**, planner, plant "
             'or driver, the nodes that read parameters of an actuator\n')
     with pytest.warns(AssumedWarning, match='/planr'):
