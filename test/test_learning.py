@@ -124,16 +124,6 @@ def test_a_repeat_that_left_more_is_taken_back():
     assert len(limited) == len(found.levels)
 
 
-def test_after_two_repeats_that_left_more_the_best_one_is_repeated():
-    levels = planned()
-    bench = Bench(0, max(abs(b) for _, b in levels))
-    sets = [levels, [(t, 1.05 * b) for t, b in levels], [(t, 1.03 * b) for t, b in levels]]
-    trials = [bench.trial(bench.repeat(x), x) for x in sets]
-    found = learn(trials, TARGETS, NOMINAL)
-    assert (found.best, found.repeated) == (0, True)
-    assert found.levels == pytest.approx(trials[0].at(found.level_times + 1e-6), abs=1e-12)
-
-
 def test_repeats_bring_two_modes_to_rest_and_return_to_the_best_one():
     block = Actuator(damping_ratio=0.05, chain_limit=5.0)
     real = replace(block.block, mass_factor=1.2, modes=Modes((1.4,), (0.2,), (0.08,)))

@@ -238,14 +238,13 @@ def test_a_section_is_for_the_nodes_that_ros_gives_it_to(make_ros, tmp_path):
     file = tmp_path / 'it.yaml'
     keys = ('/**', '/*', 'planner', '/planner', 'left/planner', '/left/planner', '/*/planner',
             '/**/planner', '/left/*', '/left/**', '/plan', '/right/planner', '/left/plant')
+    file.write_text(''.join(
+        f'{x}:\n  ros__parameters:\n    it_{i}: 1\n' for i, x in enumerate(keys)))
     for node, space in (('planner', ''), ('planner', '/left')):
-        given = {}
-        for key in keys:
-            file.write_text(f'{key}:\n  ros__parameters:\n    it: 1\n', encoding='utf-8')
-            side = make_ros(cli_args=[
-                '--ros-args', '-r', f'__node:={node}', '-r', f'__ns:={space or "/"}',
-                '--params-file', str(file)])
-            given[key] = 'it' in side.node._parameter_overrides
+        side = make_ros(cli_args=[
+            '--ros-args', '-r', f'__node:={node}', '-r', f'__ns:={space or "/"}',
+            '--params-file', str(file)])
+        given = {x: f'it_{i}' in side.node._parameter_overrides for i, x in enumerate(keys)}
         assert {x: is_for(y, f'{space}/{node}') for x in keys
                 for y, _ in sections_of({x: {'ros__parameters': {'it': 1}}})} == given
 
