@@ -291,7 +291,7 @@ def test_arrays_and_files_of_a_path_are_followed_too(tmp_path, capsys):
     written = np.loadtxt(tmp_path / 'levels.csv', delimiter=',', skiprows=1)
     assert written == pytest.approx(plan.levels, abs=1e-12)
     head, _, row, *rest = capsys.readouterr().out.splitlines()
-    assert head.split()[:3] == ['lowest', 'stretch', 'highest']
+    assert head.split()[:3] == ['minimum', 'stretch', 'maximum']
     assert '∞' not in row
     assert any(x.split()[:2] == ['deviation', 'maximum'] for x in rest)
     assert main(['plan', '--path', str(tmp_path / 'path.csv'), '--params-file',

@@ -254,7 +254,8 @@ def _along(actuator: 'Actuator', arguments: argparse.Namespace) -> int:
     record['path'] = asdict(found)
     name = actuator.model.material.coordinate.name
     columns = [
-        Column('lowest', '', '.6g', f'lowest {name}'), Column('highest'), Column('duration', 's'),
+        Column('lowest', '', '.6g', f'minimum {name}'),
+        Column('highest', '', '.6g', 'maximum'), Column('duration', 's'),
         Column('peak rate', '1/s', '.4g'), Column('levels'), Column('peak field', 'T', '.4g'),
         Column('peak field rate', 'T/s', '.4g'), Column('deviation', '', '.2g')]
     row: list[float] = [

@@ -124,11 +124,13 @@ def level_table(levels: Sequence[LevelResult]) -> Table:
     return Table((
         *([Column('joint')] if several else []), Column('level', 'mT', '.4g'),
         Column('times'),
-        Column('in all', 'ms', '.4g'), *(
-            Column(x, '', '.5f') for x in ('rest', 'mean', 'least', 'greatest'))), tuple(
+        Column('in all', 'ms', '.4g', 'total'), Column('rest', '', '.5f'),
+        Column('mean', '', '.5f'), Column('least', '', '.5f', 'minimum'),
+        Column('greatest', '', '.5f', 'maximum')), tuple(
         (*([x.joint] if several else []), x.flux_density * 1e3, x.times, x.duration * 1e3,
          x.rest, x.mean, x.least, x.greatest) for x in chosen),
         'the last row is the end' + (
             f'; {short} short levels are left out' if short else ''), legend=(
+                ('times, total', 'number and sum of the durations of the level'),
                 ('rest', 'stretch that the level holds, according to the parameters'),
-                ('mean, least, greatest', 'stretches while the level was in force')))
+                ('mean, minimum, maximum', 'stretches while the level was in force')))
