@@ -45,7 +45,7 @@ _BOUND, _DRIFT = 4.0, 0.003
 _SLOWER = 0.1 * _DRIFT
 # Drift of the temperature in K in a second, deviation of a measured one, and duration in s at rest
 # in which it counts as constant (`hmsa_studies.warming`).
-_WARMS, _MEASURED, _CONSTANT = 0.2, 0.3, 0.5
+_WARMS, _MEASURED, _CONSTANT = 0.2, 0.3, 1.0
 # Fraction of this maximum above which an estimate is not trusted, except for uncertain parameters.
 _STRANGE, _FREELY = 0.98, ('damping_coefficient', 'viscoelastic_time')
 # Factor on a variance that keeps a parameter fixed.
