@@ -37,7 +37,7 @@ _SMOOTH = 0.5
 # the noise and as a fraction.
 _FIRSTS = np.geomspace(0.45, 1.3, 16)
 _FREQUENCIES, _SHARE, _DAMPING = np.geomspace(1.1, 12.0, 80), 0.05, 0.02
-_CERTAIN, _IMPROVED = 40.0, 0.02
+_CERTAIN, _IMPROVED = 40.0, 0.15
 # Minimum ratio of a mode: what is nearer is the first one, whose frequency changes with the swing.
 _NEAREST = 1.08
 # Maximum share of a mode, exponent of the stretch in its ratio, and number of samples to fit.
