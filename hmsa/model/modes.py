@@ -30,11 +30,11 @@ class Modes:
     Up to three secondary modes, which vibrate beside the first.
 
     The stretch is the sum of s_i z_i over all modes, with shares s_i that add up to 1. The first
-    mode obeys the equation of motion. Each other one is an oscillator about the same rest under
-    the present load, z'' + 2 d w z' + w^2 (z - rest) = 0, where w is the natural frequency of the
-    first mode about this rest times a ratio, which may grow with a power of the stretch there. At
-    rest, all z_i equal the stretch. The ratio of its share to that of the first mode may grow with
-    a power of the position z_1 of the first mode.
+    mode obeys the equation of motion. Each other one is an oscillator about the same rest,
+    z'' + 2 d w z' + w^2 (z - z_1 - f/k) = 0. There, f is the load less the elastic force at the
+    position z_1 of the first mode, k the stiffness there, and w the natural frequency of small
+    motion about it times a ratio, which may grow with a power of z_1, as may the ratio of the
+    share to that of the first mode. At rest, all z_i equal the stretch.
     """
 
     ratios: tuple[float, ...] = ()  #: of frequency to that of the first mode, above 1 to 100

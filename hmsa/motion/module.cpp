@@ -228,7 +228,7 @@ auto two_step_late(double start, double rate, double target, double least, doubl
     if (fit(creeping <= most_branches))
         found = with_system(material.data, [&](const auto &system) {
             using System = std::decay_t<decltype(system)>;
-            return with_branches<double, System>(branches.data, creeping, material.data, [&](const auto &all) {
+            return with_branches<double, System>(branches.data, creeping, [&](const auto &all) {
                 return late(system, all, material.data, {start, rate, target},
                     {least, most, rtol, hold}, {field, load, lag, branches.data, creeping, known});
             });
@@ -291,7 +291,7 @@ int follow(int first, int last, Array<const bool> wanted, Results state, Results
         const bool done = with_system(packed,
             [&](const auto &system) {
                 using System = std::decay_t<decltype(system)>;
-                return with_branches<double, System>(own, creeping, packed, [&](const auto &all) {
+                return with_branches<double, System>(own, creeping, [&](const auto &all) {
                     return advance_row(plant, i, system, all);
                 });
             });
@@ -313,7 +313,7 @@ bool sample_of(double stretch, double rate, double field, Numbers switches, Numb
     return apart([&] {
         return with_system(material.data, [&](const auto &system) {
             using System = std::decay_t<decltype(system)>;
-            return with_branches<double, System>(branches.data, creeping, material.data, [&](const auto &all) {
+            return with_branches<double, System>(branches.data, creeping, [&](const auto &all) {
                 return sample(system, all, course);
             });
         });

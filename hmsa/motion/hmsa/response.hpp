@@ -52,52 +52,31 @@ struct Recorded {
     }
 };
 
-// Secondary modes with derivatives by parameters: oscillators about the rest under the present load.
+// Secondary modes with derivatives by parameters, as `Modes` of system.hpp.
 template <class S> struct Modal {
     int count = 0;
     S ratio[most_modes], share[most_modes], damping[most_modes], exponent[most_modes],
         share_exponent[most_modes];
     bool graded = false;  // whether shares change with the stretch
-    const double *material = nullptr;
-    // Rest, its natural frequency and the square of it under the load that was looked at last, and
-    // their derivatives by this load.
-    mutable double load = __builtin_nan(""), per_load, squared_per_load;
-    mutable S rest, squared;
-
-    template <class System, class Bare> HMSA_APART void find(
-        const System &system, const Bare &bare, const S &a, double left) const
+    template <class System, class Bare> HMSA_INLINE void change(const System &system, const Bare &bare,
+        const S &a, const S &net, const S *x, const S *at, S *by) const
     {
         constexpr double aside = 1e-4;  // of a central difference
         const real<S> zero{};
-        const double stiff = get(value(a), 0), l = equilibrium(bare, material, left / stiff);
-        const double stiffness = bare.elastic(l).d[0];
-        per_load = stiffness > 0 ? 1 / (stiff * stiffness) : 0;
-        rest = (left - a * system.force(S{zero + l})) * per_load;
-        rest = rest + (zero + l - value(rest));
-        const auto slope = [&](const S &x) -> S {
-            const S mass = system.acceleration(x, S{zero}, S{zero}, [&](const S &) { return S{zero + 1.0}; });
-            return (system.force(x + aside) - system.force(x - aside)) * (0.5 / aside) * mass * a;
-        };
-        squared = slope(rest);
-        squared_per_load = (get(value(slope(S{zero + (l + aside)})), 0)
-            - get(value(slope(S{zero + (l - aside)})), 0)) / (2 * aside) * per_load;
-        squared = squared + (zero + abs(stiff * stiffness / bare.mass(l)) - value(squared));
-        load = left;
-    }
-    template <class System, class Bare> HMSA_INLINE void change(const System &system, const Bare &bare,
-        const S &a, const S &left, const S *at, S *by) const
-    {
-        if (!(get(value(left), 0) == load))
-            find(system, bare, a, get(value(left), 0));
-        const S off = left - load;  // 0, with derivatives
-        const S middle = off * per_load + rest, square = off * squared_per_load + squared;
+        const S &l = x[0];
+        const S light = system.acceleration(
+            l, S{zero}, S{zero}, [&](const S &) { return S{zero + 1.0}; });
+        const double here = get(value(l), 0), stiff = get(value(a), 0);
+        S square = (system.force(l + aside) - system.force(l - aside)) * (0.5 / aside) * light * a;
+        square = square + (zero + abs(stiff * bare.elastic(here).d[0] / bare.mass(here)) - value(square));
         const real<S> root = sqrt(value(square));
         const S frequency = square * (0.5 / root) + 0.5 * root;
+        const S pull = net * light;
         for (int k = 0; k < count; k++, at += 2, by += 2) {
-            // The rest of a beam may be 0, and its exponent is.
-            const S grown = get(value(middle), 0) > 0 ? power(middle, exponent[k]) * ratio[k] : ratio[k];
+            // The position of a beam may be 0, and its exponent is.
+            const S grown = here > 0 ? power(l, exponent[k]) * ratio[k] : ratio[k];
             by[0] = at[1];
-            by[1] = square * grown * grown * (middle - at[0]) - frequency * grown * damping[k] * 2.0 * at[1];
+            by[1] = grown * grown * (pull + square * (l - at[0])) - frequency * grown * damping[k] * 2.0 * at[1];
         }
     }
     // What a sensor sees of a state: stretch and rate of the first mode, and of the others.
@@ -198,7 +177,7 @@ template <class C, class System, int NB = most_branches> struct Response {
                 });
         }
         if constexpr (modal) {
-            modes.count = of.modes, modes.material = of.material;
+            modes.count = of.modes;
             for (int k = 0; k < of.modes; k++) {
                 const int at = first_branch + branch_places * creeping + mode_places * k;
                 modes.ratio[k] = seeded_at(at), modes.share[k] = seeded_at(at + 1);
@@ -227,20 +206,20 @@ template <class C, class System, int NB = most_branches> struct Response {
                 incline(pull, squares, slope(pull, squares) - abs(v) * v);
         }
         by[0] = x[1];
-        [[maybe_unused]] S left{};  // for the elastic force
+        [[maybe_unused]] S net{};
         by[1] = system.acceleration(x[0], x[1], damping, [&](const S &elastic)
             __attribute__((always_inline)) {
                 S held = elastic;
                 branches.hold(elastic, x + 2, by + 2, [&](const S &more)
                     __attribute__((always_inline)) { held = held + more; });
+                const S beyond = pull - a * held;
                 if constexpr (modal)
-                    if (modes.count)
-                        left = pull - a * (held - elastic);
-                return pull - a * held;
+                    net = beyond;
+                return beyond;
             });
         if constexpr (modal)
             if (modes.count)
-                modes.change(system, bare, a, left, x + 2 + creeping, by + 2 + creeping);
+                modes.change(system, bare, a, net, x, x + 2 + creeping, by + 2 + creeping);
     }
     // A sample of a state, moved on at its rate for some time.
     void put(int i, const S *y, double after = 0) const

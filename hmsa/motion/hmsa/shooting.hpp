@@ -119,7 +119,7 @@ template <class System, int P> struct Shooting {
     // Integrates the pieces; with derivatives if S has them.
     template <class S> bool respond(double rtol)
     {
-        return with_branches<S, System>(shot.branches, shot.branch_count, material, [&](const auto &branches) {
+        return with_branches<S, System>(shot.branches, shot.branch_count, [&](const auto &branches) {
             return respond<S>(branches, rtol);
         });
     }
@@ -286,7 +286,7 @@ template <class System, int P> struct Shooting {
         const int n = shot.unknowns, levels = shot.levels;
         lasts = __builtin_nan("");
         material = packed, zeta = material[zeta_at];
-        branches.read(shot.branches, shot.branch_count, material);
+        branches.read(shot.branches, shot.branch_count);
         const auto elastic = system.elastic(shot.target);
         force = elastic.v, stiffness = elastic.d[0];
         frequency_at_target = frequency(system, shot.target);

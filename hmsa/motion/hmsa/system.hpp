@@ -317,20 +317,13 @@ constexpr int most_rows = most_branches + 2 * most_modes;
 // which the frequency ratio grows.
 enum Column { ratio_at, speed_at, flow_at, follower_at = flow_at + 1 + flow_constants, branch_columns };
 
-template <class System> double equilibrium(const System &system, const double *m, double beta);
-
-// Secondary modes: oscillators about the rest under the present load, whose frequencies are in
-// proportion to that of the first mode there, and to a power of the stretch. The first of them is
-// the second mode of the elastica, if the actuator is one.
+// Secondary modes: oscillators about the same rest as the first mode, whose frequencies are in
+// proportion to that of small motion of the first mode about its present position, and to a power
+// of this. The first of them is the second mode of the elastica, if the actuator is one.
 struct Modes {
     int count = 0;
     double share[most_modes] = {}, ratio[most_modes] = {}, damping[most_modes] = {},
         exponent[most_modes] = {};
-    const double *material = nullptr;  // packed
-    struct Rest {
-        double load = __builtin_nan(""), stretch, per_load, squared, squared_per_load;
-    };
-    mutable Rest rest;  // under the load that was looked at last
 
     void read(const double *rows, int rows_left)
     {
@@ -341,19 +334,10 @@ struct Modes {
             exponent[count++] = rows[flow_at + 2];
         }
     }
-    template <class System> HMSA_APART void find(const System &system, double load) const
-    {
-        constexpr double aside = 1e-5;  // of a central difference
-        const auto squared = [&](double l) { return system.elastic(l).d[0] / system.mass(l); };
-        const double l = equilibrium(system, material, load), stiffness = system.elastic(l).d[0];
-        const double per_load = stiffness > 0 ? 1 / stiffness : 0;
-        rest = {load, l, per_load, abs(squared(l)),
-            (squared(l + aside) - squared(l - aside)) / (2 * aside) * per_load};
-    }
-    // Changes of positions and rates, in turns, under the load that is left for the elastic force.
-    // The first two of a state are those of the first mode, those of others start at a place.
+    // Changes of positions and rates, in turns, under the load beyond the elastic force. The first
+    // two of a state are those of the first mode, those of others start at a place.
     template <class System, class S> HMSA_INLINE void change(
-        const System &system, const S &load, const S *state, S *changes, int place) const
+        const System &system, const S &net, const S *state, S *changes, int place) const
     {
         const S *at = state + place;
         S *by = changes + place;
@@ -361,24 +345,29 @@ struct Modes {
         if constexpr (System::may_bend)
             if (system.kind == elastica) {
                 by[0] = at[1];
-                by[1] = system.beam_law.second(state[0], state[1], at[0], at[1],
-                    S(load - system.force(state[0])), ratio[0], share[0], damping[0], changes[1]);
+                by[1] = system.beam_law.second(state[0], state[1], at[0], at[1], net, ratio[0],
+                    share[0], damping[0], changes[1]);
                 if (++k == count)
                     return;
                 at += 2, by += 2;
             }
-        if (!(value(load) == rest.load))
-            find(system, value(load));
-        const S off = load - rest.load;  // 0, with derivatives
-        const S middle = off * rest.per_load + rest.stretch;
-        const S squared = off * rest.squared_per_load + rest.squared;
-        const S frequency = squared * (0.5 / sqrt(rest.squared)) + 0.5 * sqrt(rest.squared);
+        constexpr double aside = 1e-5;  // of a central difference
+        const S &l = state[0];
+        const double x = value(l);
+        const auto squared = [&](double y) { return abs(system.elastic(y).d[0] / system.mass(y)); };
+        const auto slope = [&](double before, double after) { return (after - before) / (2 * aside); };
+        const double here = squared(x), mass = system.mass(x), root = sqrt(here);
+        const S square = through(l, here, slope(squared(x - aside), squared(x + aside)));
+        const S light = through(
+            l, 1 / mass, slope(1 / system.mass(x - aside), 1 / system.mass(x + aside)));
+        const S frequency = square * (0.5 / root) + 0.5 * root;
+        const S pull = net * light;
         for (; k < count; k++, at += 2, by += 2) {
-            S grown = 0.0 * off + ratio[k];
+            S grown = 0.0 * l + ratio[k];
             if (exponent[k] != 0)
-                grown = grown * power(middle, exponent[k]);
+                grown = grown * power(l, exponent[k]);
             by[0] = at[1];
-            by[1] = squared * grown * grown * (middle - at[0])
+            by[1] = grown * grown * (pull + square * (l - at[0]))
                 - frequency * grown * (2 * damping[k]) * at[1];
         }
     }
@@ -403,16 +392,14 @@ template <int NB, class C = double> struct Branches {
         else
             return NB;
     }
-    void read(const double *from, int rows, const double *material = nullptr)
+    void read(const double *from, int rows)
     {
         int count = 0;
         while (count < rows && from[branch_columns * count + flow_at] >= 0)
             count++;
         in_use = count;
-        if constexpr (flows) {
-            modes.material = material;
+        if constexpr (flows)
             modes.read(from + branch_columns * count, rows - count);
-        }
         for (int b = 0; b < count; b++, from += branch_columns) {
             ratio[b] = from[ratio_at];
             speed[b] = from[speed_at];
@@ -455,11 +442,10 @@ template <class System> constexpr bool has_own_code = false;
 template <class C, template <class> class Law> constexpr bool has_own_code<Block<C, Law>> = true;
 // Calls f with the branches and modes of rows. No branch and one linear branch have their own code,
 // unless it would be compiled again for each of many derivatives.
-template <class S, class System, class F> auto with_branches(
-    const double *rows, int count, const double *material, const F &f)
+template <class S, class System, class F> auto with_branches(const double *rows, int count, const F &f)
 {
     const auto call = [&](auto branches) {
-        branches.read(rows, count, material);
+        branches.read(rows, count);
         return f(branches);
     };
     if constexpr (count_of<S> <= 1) {
@@ -476,7 +462,7 @@ template <int NB, class System, class S, class L> HMSA_INLINE void change(const 
     const Branches<NB> &branches, const S *x, const L &load, S *by, real<S> *squared = nullptr)
 {
     by[0] = x[1];
-    [[maybe_unused]] S left{};  // for the elastic force
+    [[maybe_unused]] S beyond{};  // the elastic force
     by[1] = system.acceleration(x[0], x[1], system.drag, [&](const S &force)
         __attribute__((always_inline)) {
             S net = load - force;
@@ -484,12 +470,12 @@ template <int NB, class System, class S, class L> HMSA_INLINE void change(const 
                 __attribute__((always_inline)) { net = net - held; });
             if constexpr (NB == most_branches && lanes<real<S>> == 1)
                 if (branches.modes.count)
-                    left = net + force;
+                    beyond = net;
             return net;
         }, squared);
     if constexpr (NB == most_branches && lanes<real<S>> == 1)
         if (branches.modes.count)
-            branches.modes.change(system, left, x, by, 2 + branches.count());
+            branches.modes.change(system, beyond, x, by, 2 + branches.count());
 }
 
 // Frequency of small undamped motion about a stretch; the growth rate where the force falls.
