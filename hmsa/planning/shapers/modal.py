@@ -1,14 +1,15 @@
 """
 Rest of the first mode and of all secondary modes that ring, for actuators that are continua.
 
-A move has two free levels for the first mode and two more for each secondary one, and further ones
-on real hardware as in `free`.
+A move has more free levels than rest has conditions: two for each mode, and further ones on real
+hardware as in `free`.
 
 Those of a block have equal durations. A command that is as short as possible would excite the
-modes that no model contains: by default it takes two half periods of the first mode. The secondary
-modes of a beam are fast and weak: its command is the two-step command, convolved with an input
-shaper of zero vibration (N. C. Singer, W. P. Seering, J. Dyn. Syst. Meas. Control 112, 76, 1990)
-for each of them, and changed as little as rest demands. It has more levels than conditions.
+modes that no model contains: by default it takes two half periods of the first mode. Of all levels
+that bring the modes to rest, it has those that are expected to leave least in weak modes. The
+secondary modes of a beam are fast and weak: its command is the two-step command, convolved with an
+input shaper of zero vibration (N. C. Singer, W. P. Seering, J. Dyn. Syst. Meas. Control 112, 76,
+1990) for each of them, and changed as little as rest demands.
 """
 
 from collections.abc import Iterator, Sequence
@@ -32,15 +33,13 @@ from hmsa.planning.shooting import Attempt, heights, solve, within_limits
 # Durations to try, in units of the wanted one: near solutions that swing back and forth there are
 # others without (benchmarks continuum).
 _LENGTHS = (1.0, 1.06, 0.94, 1.14, 1.25, 1.4, 1.6, 2.0)
-# Up to this order a block has as many levels as conditions. Beyond, it has this many, and takes
-# this fraction of the half periods.
-_PLAIN, _SMOOTH, _SHORTER = 2, 12, 0.975
-# Frequency ratio of the weak modes from which a block takes this fraction of the half periods at
-# order 2. Where they are slower, as much leaves more than 3 % (benchmarks continuum).
-_FAR, _BRISK = 4.0, 0.955
-# Weight of the vibration by an error of all frequencies against bends of the levels: of 0 to
-# infinity, that which leaves least on finite elements.
-_ROBUST = 10.0
+# Levels of a block in each half period, and fractions of those that it takes: the second if weak
+# modes have this mean frequency ratio or more (benchmarks continuum).
+_LEVELS, _SHORTER, _BRISK, _FAR = 4, 0.97, 0.955, 4.0
+# For the expected vibration: relative error of all frequencies, weight of the bends, multiples of
+# the fastest ringing mode and of the mean of the weak ones between which these are, and how many;
+# mean in units of the fastest and share of those that nobody gave.
+_ERROR, _BENT, _ABOVE, _WIDE, _BAND, _UNKNOWN = 0.03, 0.01, 1.1, 1.5, 24, (1.4, 0.05)
 # Largest load beyond those of start and end, in units of the largest change that the motion needs.
 _BEYOND = 0.3
 # Durations of levels in units of those of their ramps, at least.
@@ -62,8 +61,9 @@ def modal(request: MoveRequest) -> Move:
     Without secondary modes, the two-step command does so, and is returned. Raise `RefusedError` if
     no such command keeps the limits.
     """
-    brisk = any(x >= _FAR for i, x in enumerate(request.material.modes.ratios)
-                if i not in request.material.modes.ringing)
+    modes = request.material.modes
+    weak = [(x, y) for i, (x, y) in enumerate(zip(modes.ratios, modes.shares, strict=True))
+            if i not in modes.ringing]
     request = _of_ringing(request)
     if not request.material.modes:
         return two_step(request)
@@ -73,7 +73,7 @@ def modal(request: MoveRequest) -> Move:
     reach = _BEYOND * _largest_change(request, holding)
     limits = min(request.load, holding) - reach, max(request.load, holding) + reach
     widest: Attempt = None
-    for found in _solutions(request, holding, brisk=brisk):
+    for found in _solutions(request, holding, weak):
         loads = [x.load for x in found[0]]
         if limits[0] <= min(loads) and max(loads) <= limits[1]:
             return Move(Code.MODAL, *found)
@@ -117,10 +117,10 @@ def _largest_change(request: MoveRequest, holding: float) -> float:
 
 
 def _solutions(
-        request: MoveRequest, holding: float, *, brisk: bool
+        request: MoveRequest, holding: float, weak: Sequence[tuple[float, float]]
 ) -> Iterator[tuple[tuple[Level, ...], float]]:
     """Yield commands that end at rest within the limits."""
-    guesses = (partial(_equal, brisk=brisk) if request.material.rest != 0.0
+    guesses = (partial(_equal, weak=weak) if request.material.rest != 0.0
                else _around_two_steps)
     before: tuple[float, ...] = ()
     for wanted, loads in guesses(request, holding):
@@ -135,57 +135,65 @@ def _solutions(
             yield found
 
 
-def _equal(request: MoveRequest, holding: float, *, brisk: bool) -> Iterator[_Guess]:
+def _equal(
+        request: MoveRequest, holding: float, weak: Sequence[tuple[float, float]]
+) -> Iterator[_Guess]:
     """Yield equal durations, and loads that change smoothly from the present one to the last."""
-    delivery = request.delivery
-    count = request.unknowns + 2 * len(request.material.modes.ratios)
-    smooth = request.order > _PLAIN
-    whole = (_SHORTER if smooth else _BRISK if brisk else 1.0) * (
-        request.order * math.pi / request.frequency)
-    hardware = delivery.lag + delivery.ramp(holding - request.load)
-    # A raised cosine, which all conditions change.
-    shares = [0.5 * (1.0 - math.cos(math.pi * (i + 1) / (count + 1))) for i in range(count)]
+    count = max(
+        _LEVELS * request.order, request.unknowns + 2 * len(request.material.modes.ratios))
+    far = bool(weak) and weak[0][0] >= _FAR
+    whole = (_BRISK if far else _SHORTER) * request.order * math.pi / request.frequency
+    hardware = request.delivery.lag + request.delivery.ramp(holding - request.load)
     for length in _LENGTHS:
-        if smooth:
-            shares = _smooth(length * whole / _SMOOTH, request).tolist()
-        yield [(length * whole + hardware) / len(shares)] * len(shares), [
+        shares = _smooth(length * whole / count, count, request, weak).tolist()
+        yield [(length * whole + hardware) / count] * count, [
             request.load + (holding - request.load) * x for x in shares]
 
 
-def _smooth(each: float, request: MoveRequest) -> Array:
+def _smooth(
+        each: float, count: int, request: MoveRequest, weak: Sequence[tuple[float, float]]
+) -> Array:
     """
     Return a smooth rise from 0 to 1, in levels of a duration, after which all modes rest.
 
-    This is in linear motion about the target. An error of the first frequency excites little.
+    This is in linear motion about the target. Of all such levels, they leave least on average if
+    frequencies have errors, and weak modes any frequency near their mean.
     """
     packed, target, modes = request.material.packed, request.target, request.material.modes
     frequency = request.frequency
     damping = float(law.damping(target, packed) / law.mass(target, packed)) / (2.0 * frequency)
-    ratios = [(1.0, damping), *(
-        (ratio * target ** exponent, damping)
-        for ratio, _, damping, exponent, _ in modes.numbers)]
-    left = each * np.arange(-_SMOOTH, 1)
-    effects = [np.exp(frequency * ratio * complex(y, math.sqrt(max(1.0 - y * y, 0.0))) * left)
-               for ratio, y in ratios]
-    bends: Array = np.diff(np.eye(_SMOOTH + 4), 2, axis=0)
+    ringing = [(1.0, damping), *(
+        (ratio * target ** exponent, own) for ratio, _, own, exponent, _ in modes.numbers)]
+    fastest = max(x for x, _ in ringing)
+    mean, share = weak[0] if weak else (_UNKNOWN[0] * fastest, _UNKNOWN[1])
+    band = np.geomspace(min(_ABOVE * fastest, mean), _WIDE * mean, _BAND)
+    left = each * np.arange(-count, 1)
+
+    def effects(ratios: Array, dampings: Array) -> NDArray[np.complex128]:
+        damped = np.sqrt(np.maximum(1.0 - dampings ** 2, 0.0))
+        rates = frequency * ratios * (dampings + 1j * damped)
+        found: NDArray[np.complex128] = np.exp(np.outer(rates, left))
+        return found
 
     def parts(effect: NDArray[np.complex128]) -> tuple[Array, Array]:
         # By the free levels, and by the last one, which is 1; the first change starts at 0.
-        rows: Array = np.array([effect.real, effect.imag])
+        rows = np.concatenate([effect.real, effect.imag])
         return rows[:, :-1] - rows[:, 1:], rows[:, -1]
 
-    # What the same relative error of each frequency leaves.
-    by_frequency = [parts(math.sqrt(_ROBUST) * share * frequency * x * left * y) for share, (
-        x, _), y in zip(modes.at(target), ratios, effects, strict=True)]
+    rings = effects(*np.array(ringing).T)
+    bends: Array = _BENT * np.diff(np.eye(count + 4), 2, axis=0)
     free, last = (np.concatenate(x) for x in zip(
-        (bends[:, 2:-2], bends[:, -2:].sum(axis=1)), *by_frequency, strict=True))
-    conditions, ends = (np.concatenate(x) for x in zip(
-        *(parts(x) for x in effects), strict=True))
+        (bends[:, 2:-2], bends[:, -2:].sum(axis=1)),
+        parts(_ERROR * frequency * np.outer(
+            [x * y for x, (y, _) in zip(modes.at(target), ringing, strict=True)], left) * rings),
+        parts(share / math.sqrt(_BAND) * effects(band, np.minimum(damping * band, 1.0))),
+        strict=True))
+    conditions, ends = parts(rings)
     # Least squares with Lagrange multipliers; frequencies that coincide give equal conditions.
     none = np.zeros((len(ends), len(ends)))
     found: Array = np.linalg.lstsq(
         np.block([[free.T @ free, conditions.T], [conditions, none]]),
-        np.concatenate([-free.T @ last, -ends]), rcond=None)[0][:_SMOOTH]
+        np.concatenate([-free.T @ last, -ends]), rcond=None)[0][:count]
     return found
 
 
