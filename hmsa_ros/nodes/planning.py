@@ -248,7 +248,8 @@ def settings_from(values: JointParameters) -> Settings:
     if modal and values['feedback'] in ('adapt', 'cautious'):
         raise BadInputError(
             f'parameter feedback is {values["feedback"]} and {modal[0]} has modes.*: expected '
-            'observe or off, since feedback does not support secondary modes')
+            'observe or off, since feedback does not support secondary modes; hmsa identify fits '
+            'them to a recording, and hmsa learn corrects a sequence by its repeats')
     times: dict[str, Any] = {x: _nanoseconds(values[x]) for x in (
         'heartbeat_period', 'lateness_tolerance', 'takeover_timeout', 'takeover_max_age',
         'temperature_max_age')}
