@@ -49,6 +49,8 @@ BROKEN = {
                'self.n % 10 or setattr(self, "x", super().read(now)[0]); '
                'return [(*self.x[:2], time_ns())]', 'samples_new'),
     'polarity': ('def write(self, level, now): super().write(-level, now)', 'polarity'),
+    'millimetres': ('def read(self, now): return [(20.0 * x, 0.0, t) for x, _, t in '
+                    'super().read(now)]', 'rest'),
     'zero': ('def write(self, level, now): super().write(level or 1e-3, now)', 'off_at_close'),
     'clock': ('def clock(self): sleep(0.01); return time_ns()', 'clock'),
     'forgetful': ('def write(self, level, now): self.n = getattr(self, "n", 0) + 1; '

@@ -212,7 +212,7 @@ def _usable(
         value = float(np.median(values[~inside]))
         return stamps[:0], values[:0], (
             f'the sensor shows {value:.4g}, where nothing can be: expected {low:.4g} to '
-            f'{high:.4g}')
+            f'{high:.4g}; look at its gain, offset and length at rest')
     stamps, values = stamps[inside], values[inside]
     return stamps, values, _frozen(values, setpoint)
 

@@ -40,6 +40,8 @@ _FEW, _CHANCE = 0.05, 2.0
 # the coil seem on or off, and minimum fraction of the response between rest and either level for
 # 0 T to count as off.
 _SEEN, _DISTINCT = 50.0, 0.3
+# Largest distance of the reading without a field from that of an actuator.
+_AT_REST = 0.3
 
 
 class Check(NamedTuple):
@@ -279,6 +281,13 @@ class ConformanceTrial:
     def _check_response(self, rest: PhaseResults, up: PhaseResults, down: PhaseResults) -> None:
         means = [float(np.mean(x)) if len(x) else math.nan for x in (
             y.stretch[len(y.stretch) // 2:] for y in (rest, up, down))]
+        if len(rest.stretch):
+            # A stretch is 1 without a field, and the deflection of a beam 0.
+            self._note(
+                'rest', min(abs(means[0] - 1.0), abs(means[0])), '', _AT_REST,
+                f'the sensor shows {means[0]:.4g} without a field',
+                'expected about 1, or 0 for a beam: correct gain, offset and rest_length of the '
+                'sensor, or zero it')
         spread = float(np.std(rest.stretch)) if len(rest.stretch) else math.nan
         apart = means[1] - means[2]
         resolved = _SEEN * spread / math.sqrt(max(len(rest.stretch) // 2, 1))
