@@ -12,9 +12,11 @@ from sphinx.application import Sphinx
 
 WORDS = {
     'explanation/beam': ('beam', 'cantilever', 'strip'),
+    'explanation/compressibility': ('bulk modulus', 'pores'),
     'explanation/creep': ('viscoelastic', 'relaxation'),
     'explanation/faults': ('emergency stop', 'interlock', 'watchdog'),
     'explanation/modes': ('mode shapes',),
+    'explanation/temperature': ('temperature', 'warming'),
     'explanation/which-shaper': ('choose a shaper', 'input shaping', 'ZV'),
     'guides/calibration': ('field to current', 'current', 'ampere', 'coil constant'),
     'guides/hyperelastic-models': ('Gent', 'Ogden', 'Yeoh', 'stress-strain curve'),
@@ -30,7 +32,7 @@ WORDS = {
     'reference/driver': ('bench supply',),
     'tutorials/first-run': ('demo', 'install'),
     'tutorials/identify': ('system identification', 'fit parameters'),
-    'tutorials/notebook': ('Python', 'notebook', 'pandas', 'xarray'),
+    'tutorials/notebook': ('Python', 'notebook', 'pandas', 'xarray', 'pint'),
     'tutorials/your-own-driver': ('own driver', 'amplifier'),
 }
 
