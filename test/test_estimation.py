@@ -257,7 +257,7 @@ def test_a_bias_and_a_constant_force_are_said_to_be_confounded_until_two_targets
     for count in (25, len(samples)):
         _, found = run(samples[:count], prior=nominal, times=SAMPLED[:count])
         words = sentence(found, nominal.values, 0.0, 1.0, 1.0, 0.0, 'plans use it')
-        said.append('cannot be told apart until two targets were held' in words)
+        said.append('cannot be distinguished until two targets were held' in words)
         assert said[-1] is confounded(found)
     assert said == [True, False]
     assert found.values['constant_force'] == pytest.approx(

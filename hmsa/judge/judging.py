@@ -385,7 +385,7 @@ def _open(
         mend = ('the fit residuals are not noise, so neither more samples nor less noise would '
                 'decide it')
     if 3.0 * sensor.std(setpoint.target) > 0.5 * limits[0]:
-        mend = ('a calibrated sensor would decide it: what it shows may be off by '
+        mend = ('a calibrated sensor would decide it: its reading may have an error of '
                 f'{setpoint.words(3.0 * sensor.std(setpoint.target))}')
     return f', but {" and ".join(parts)} cannot be ruled out: {mend}'
 

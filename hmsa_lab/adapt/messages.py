@@ -106,7 +106,7 @@ def sentence(
         if 2.0 * amplitude > _RINGING * abs(step):
             wrong.append(f'rings at {at[1] / (2.0 * math.pi):.0f} Hz')
     found = ', '.join(differences(estimate, nominal))
-    apart = ('a bias of the sensor and a constant force cannot be told apart until two targets '
+    apart = ('a bias of the sensor and a constant force cannot be distinguished until two targets '
              'were held' if confounded(estimate, max(_UNKNOWN, _BIASED * abs(step))) else '')
     if not wrong and not found:
         return apart or 'as known'

@@ -164,7 +164,7 @@ def _coil(arguments: argparse.Namespace) -> int:
         'saturation      ' + (f'{found.saturation:.4g} T' if math.isfinite(found.saturation)
                               else 'does not show'),
         f'hysteresis      {hysteresis}', f'probe offset    {found.offset:.3g} T',
-        f'model           {found.model}, off by at most {100.0 * found.misses:.2g} % of the range',
+        f'model           {found.model}, largest error {100.0 * found.misses:.2g} % of the range',
         written=(arguments.out, table))
 
 

@@ -299,6 +299,7 @@ _LEGEND = """\
 Peak-to-peak vibration (steady-state error) in % of the step, root mean square.
 * columns: after the first move (0.4 from rest), one and two cycles later, and after the next move
   (to 0.1); the error that remains if nothing is corrected from then on
+* G: error of the shear modulus
 * robust: order 2
 * learning: the four columns are four trials of the first move
 * LQR, MPC: measured in the cycle that follows, with the loop closed
@@ -318,7 +319,7 @@ def _show_matrix(
     before = ''
     for row in rows:
         if row.scenario != before:
-            print(f'\n{row.scenario}\n{"G off":>6} {"strategy":<9} {"after the move":>16} '
+            print(f'\n{row.scenario}\n{"G":>6} {"strategy":<9} {"after the move":>16} '
                   f'{"a cycle later":>16} {"two cycles":>16} {"next move":>16} {"worst":>7} '
                   'no worse')
             before = row.scenario
