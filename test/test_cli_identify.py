@@ -333,3 +333,25 @@ def test_times_of_the_day_beside_levels_that_begin_at_zero_are_named_as_clocks(t
     levels.write_text('time,flux_density\n0.0,0.0\n0.5,0.05\n1.0,0.02\n')
     with pytest.raises(BadInputError, match='expected times of one clock, not seconds since'):
         read_csv(samples, levels)
+
+
+def test_of_more_switches_than_can_be_estimated_the_first_are_used_and_a_measured_field_is_kept(
+        folder):
+    time = np.arange(40_000) * 5e-4
+    moves = 1.0 + 0.1 * (np.arange(40_000) // 100 % 2)
+    seen = moves + 1e-3 * np.random.default_rng(0).standard_normal(40_000)
+    write('moves.csv', 'time,stretch,flux_density', zip(time, seen, 0.3 * moves, strict=True))
+    found = read_csv(folder / 'moves.csv')
+    assert len(found.time) == 30_000
+    assert len(found.uncertain) == 299
+    note, = (x for x in found.notes if 'are used' in x)
+    assert 'has 399 switches: the first 299, up to 15 s' in note
+    # With the levels, all samples are used.
+    write('all.csv', 'time,flux_density', ((k * 0.05, 0.3 + 0.03 * (k % 2)) for k in range(400)))
+    assert len(read_csv(folder / 'moves.csv', folder / 'all.csv').time) == 40_000
+    # The converter of a probe flickers.
+    probe = 0.3 * moves + 1e-4 * (np.arange(40_000) // 7 % 2)
+    write('probe.csv', 'time,stretch,flux_density', zip(time, seen, probe, strict=True))
+    found = read_csv(folder / 'probe.csv')
+    assert (len(found.time), found.earlier) == (40_000, 0.0)
+    assert any('taken as measured' in x for x in found.notes)

@@ -31,6 +31,7 @@ from hmsa.identification.search import rivals, search, unmoved
 from hmsa.interfaces.actuator import along_elastica, parameters_of
 from hmsa.model.equations import Array
 from hmsa.model.parameters import ActuatorParameters, paper_actuator
+from hmsa.model.residual import RESOLVED
 
 # Maximum number of iterations for the timestamp errors.
 _MOST_SPREADS = 3
@@ -361,8 +362,11 @@ def _modes_left(
     """
     Return the modes that residuals show more than any other departure, also as departures.
 
-    A fit that is not rejected for other reasons needs stronger evidence of them.
+    A fit that is not rejected for other reasons needs stronger evidence of them. Residuals of
+    rounding, as a simulation without noise leaves, show none.
     """
+    if best.scale < RESOLVED * float(np.ptp(best.recording.stretch)):
+        return (), []
     leading = max((x.share for x in marks if x.found and x.remedy), default=0.0)
     lines, _ = lines_of(best, diagnosis.frequency_of(best), 1)
     if not lines or lines[0].explained < leading:

@@ -22,8 +22,10 @@ _RUN, _OVERTAKEN = 10, 3.0
 # Number of levels, relative to samples and at least, above which the column is a measured field.
 _MEASURED_FIELD = 0.3
 _FEW_LEVELS = 8
-# Maximum number of unknown switching times, for speed.
-_MOST_SWITCHES = 300
+# Maximum number of unknown switching times, for speed; of a field that changes at fewer samples
+# than the fraction, those after it are left out: taken as measured, they come half an interval
+# late, which a longer recording does not make up for.
+_MOST_SWITCHES, _SWITCHED = 300, 0.02
 # Difference of times, in s, above which clocks started at different times.
 _ANOTHER_CLOCK = 1e8
 # Units of levels to test, and the improvement of the fit of the motion that shows another unit.
@@ -92,8 +94,9 @@ def read_csv(
             notes.append(f'before the first level at {times[1]:.6g} s the field is taken to be 0')
         earlier = 0.0
     else:
-        times, levels, earlier = _sampled_levels(
+        times, levels, earlier, used = _sampled_levels(
             path, time, table.columns['flux_density'][keep], notes)
+        time, stretch = time[:used], stretch[:used]
     # Subtract the first time: seconds since an epoch leave few digits for differences.
     return Measurement(
         time - time[:1], stretch, times - time[:1], levels, slew_limit, earlier, str(path),
@@ -175,25 +178,36 @@ def _check_units(
 
 def _sampled_levels(
         path: Path, time: Array, field: Array, notes: list[str]
-) -> tuple[Array, Array, float]:
-    """Return the levels of a column of the samples, and the uncertainty of their times."""
+) -> tuple[Array, Array, float, int]:
+    """
+    Return the levels of a column of the samples, and the uncertainty of their times.
+
+    Also return the number of samples to use.
+    """
     good = np.isfinite(field)
     if not np.all(good):
         raise BadInputError(
             f'{path} has {np.count_nonzero(~good)} rows without a flux_density: expected the '
             'field in force at each sample, or its levels in a file of their own (--commands)')
     changed = np.append(True, np.diff(field) != 0.0)
-    count = int(np.count_nonzero(changed))
+    count, used = int(np.count_nonzero(changed)), len(time)
+    if _MOST_SWITCHES < count < _SWITCHED * len(time):
+        used = int(np.flatnonzero(changed)[_MOST_SWITCHES])
+        notes.append(
+            f'the flux density has {count - 1} switches: the first {_MOST_SWITCHES - 1}, up to '
+            f'{time[used] - time[0]:.4g} s, are used, since their times are estimated too; give '
+            'their true times with --commands to use all samples')
+        time, field, changed, count = time[:used], field[:used], changed[:used], _MOST_SWITCHES
     if count > max(_MEASURED_FIELD * len(time), _FEW_LEVELS) or count > _MOST_SWITCHES:
         notes.append(
             f'the flux density changes at {count} of {len(time)} samples: taken as measured, '
             'and as constant from each sample to the next; give the levels with --commands if '
             'they are known')
-        return time[changed], field[changed], 0.0
+        return time[changed], field[changed], 0.0, used
     interval = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
     if count > 1:
         notes.append(
             f'each of {count - 1} switches lies somewhere in the {interval:.3g} s before the '
             'sample that shows it, and is estimated too: give their true times with --commands '
             'for the full accuracy')
-    return time[changed], field[changed], interval
+    return time[changed], field[changed], interval, used
