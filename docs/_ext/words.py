@@ -48,4 +48,6 @@ def enter(app: Sphinx, document: nodes.document) -> None:
 def setup(app: Sphinx) -> dict[str, Any]:
     """Register the entries."""
     app.connect('doctree-read', enter)
+    # The index of the search has the entries only of pages that are written anew.
+    app.connect('env-get-outdated', lambda *_: list(WORDS))
     return {'parallel_read_safe': True, 'parallel_write_safe': True}
