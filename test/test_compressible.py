@@ -294,16 +294,17 @@ def test_first_mode_is_followed_where_another_one_has_a_larger_share():
     assert 0.3 < found.transverse_mass_factor < 5.0
 
 
-def test_first_mode_has_one_frequency_between_compression_and_tension():
-    # Where the second mode approaches the first, too; of a cube of K/G 3, most.
-    for shape, bulk in ((0.2, 10.0), (0.5, 3.0), (1.0, 3.0)):
-        free = free_block(shape, bulk)
-        first = spectrum(shape, 'free', bulk_ratio=bulk)
-        at_rest = first.frequencies[first.first]
-        for stretch in (0.9, 0.93, 0.97, 1.05, 1.15, 1.2):
-            there = spectrum(shape, 'free', stretch, J_LIM, bulk)
-            assert frequency(free, stretch) == pytest.approx(
-                there.frequencies[there.like(at_rest)], rel=4e-3)
+# Where the second mode approaches the first, too; of a cube of K/G 3, most.
+@pytest.mark.parametrize(('shape', 'bulk'), [(1.0, 3.0), *(
+    pytest.param(*x, marks=pytest.mark.slow) for x in ((0.2, 10.0), (0.5, 3.0)))])
+def test_first_mode_has_one_frequency_between_compression_and_tension(shape, bulk):
+    free = free_block(shape, bulk)
+    first = spectrum(shape, 'free', bulk_ratio=bulk)
+    at_rest = first.frequencies[first.first]
+    for stretch in (0.9, 0.93, 0.97, 1.05, 1.15, 1.2):
+        there = spectrum(shape, 'free', stretch, J_LIM, bulk)
+        assert frequency(free, stretch) == pytest.approx(
+            there.frequencies[there.like(at_rest)], rel=4e-3)
 
 
 @pytest.mark.parametrize('stretch', [0.9, 1.2])
