@@ -65,3 +65,6 @@ def respond(
 def rest(
     theta: Array, material: Array, level: float, wanted: NDArray[np.int64], slopes: Array, /
 ) -> float: ...
+# Solve for each subset of the unknowns, in place; compute the logarithms of the determinants.
+def subsets(
+    matrix: Array, varies: NDArray[np.bool_], values: Array, log_dets: Array, /) -> None: ...

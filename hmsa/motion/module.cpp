@@ -9,6 +9,7 @@
 #include "hmsa/batch.hpp"
 #include "hmsa/late.hpp"
 #include "hmsa/response.hpp"
+#include "hmsa/subsets.hpp"
 #include "hmsa/tail.hpp"
 
 namespace {
@@ -485,6 +486,18 @@ double rest(Numbers theta, Numbers material, double level, Places wanted, Result
     return hmsa::finite(quantity(stiffness_q, l, of.material)) ? l : __builtin_nan("");
 }
 
+// Solves a symmetric system for each subset of its unknowns, a row of the arrays after the matrix,
+// in place; writes the logarithms of the determinants.
+Nothing subsets(Numbers matrix, Array<const bool> varies, Results values, Results log_dets)
+{
+    const int rows = log_dets.count, count = rows ? varies.count / rows : 0;
+    if (fit(!rows || (count <= most_subset && matrix.count == count * count && varies.count == rows * count
+            && values.count == rows * count)))
+        for (int i = 0; i < rows; i++)
+            log_dets[i] = solve_subset(count, matrix.data, varies.data + i * count, values.data + i * count);
+    return {};
+}
+
 template <auto f> PyMethodDef method(const char *name)
 {
     return {name, (PyCFunction)(void (*)())bound<f>, METH_FASTCALL, nullptr};
@@ -504,7 +517,8 @@ PyMethodDef methods[] = {
     method<two_step_batch>("two_step_batch"), method<follow>("follow"),
     method<sample_of>("sample"), method<flow_rates>("flow_rates"), method<trail_of>("trail"),
     method<solve>("solve"), method<staircase>("staircase"),
-    method<respond>("respond"), method<rest>("rest"), {nullptr, nullptr, 0, nullptr}};
+    method<respond>("respond"), method<rest>("rest"),
+    method<subsets>("subsets"), {nullptr, nullptr, 0, nullptr}};
 PyModuleDef module = {PyModuleDef_HEAD_INIT, "_motion", nullptr, 0, methods, nullptr, nullptr, nullptr, nullptr};
 }  // namespace
 

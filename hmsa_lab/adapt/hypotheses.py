@@ -7,15 +7,16 @@ over all possible sets of suspects.
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 import itertools
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hmsa.model.equations import Array
+from hmsa.motion import subsets
 
 # Prior improbability of a suspect that is not named, as a logarithm, and the gain of log evidence
 # above which the set of estimated suspects changes.
@@ -39,6 +40,12 @@ class Hypotheses:
     named: int  # number of named coordinates, which come first
     known: Array  # coordinates unless estimated, shape (p,)
     priors: Array  # prior information of these, shape (p,)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Go to another process without the sets, which are large and computed only once there."""
+        return hypotheses, (
+            self.names, self.places, self.named, tuple(self.known.tolist()),
+            tuple(self.priors.tolist()))
 
     def sought(self, count: int, suspected: Iterable[int]) -> NDArray[np.bool_]:
         """Return which coordinates are estimated, shape (q,)."""
@@ -119,6 +126,14 @@ class Hypotheses:
         return found
 
 
+@lru_cache(maxsize=64)
+def hypotheses(
+        names: tuple[str, ...], places: tuple[int, ...], named: int, known: tuple[float, ...],
+        priors: tuple[float, ...]) -> Hypotheses:
+    """Return the suspects with the given fields, always the same object."""
+    return Hypotheses(names, places, named, np.array(known), np.array(priors))
+
+
 class Others(NamedTuple):
     """Contribution of other sets of suspects to the estimate."""
 
@@ -184,8 +199,9 @@ class Evidence:
         """
         found = self._all().evidence
         if information is not None:
-            found = found + 0.5 * np.linalg.slogdet(_part(information, np.pad(
-                self.suspects.seeking, ((0, 0), (0, 2)), constant_values=True)))[1]
+            sought = np.pad(self.suspects.seeking, ((0, 0), (0, 2)), constant_values=True)
+            nothing = np.zeros(sought.shape)
+            found = found + 0.5 * _solution(information, nothing, nothing, sought)[1]
         return float(np.max(found))
 
     def _without_gain(self, found: Explained, places: NDArray[np.int64]) -> Array:
@@ -201,7 +217,7 @@ class Evidence:
         there = np.where(loose, 0.0, step)
         there[:, self.suspects.gain] = 0.0
         return np.where(instead[:, None], _solution(
-            self.matrix, self.gradient, there, loose), step)
+            self.matrix, self.gradient, there, loose)[0], step)
 
     def _all(self) -> Explained:
         """
@@ -243,27 +259,29 @@ class Evidence:
 
     def _explained(self, there: Array, loose: NDArray[np.bool_], eases: Array) -> Explained:
         """Return evidence and optimum with given values for fixed coordinates."""
-        step = _solution(self.matrix, self.gradient, there, loose)
-        return Explained(step @ self.gradient - 0.5 * np.einsum(
-            'ki,ki->k', step @ self.matrix, step) - 0.5 * np.linalg.slogdet(
-                _part(self.matrix, loose))[1] + eases, step, loose)
+        step, log_det = _solution(self.matrix, self.gradient, there, loose)
+        return Explained(step @ self.gradient - 0.5 * (np.einsum(
+            'ki,ki->k', step @ self.matrix, step) + log_det) + eases, step, loose)
 
 
-def _part(matrix: Array, loose: NDArray[np.bool_]) -> Array:
-    """Return the varying part of a matrix, with identity elsewhere; shape (..., q, q)."""
-    return np.where(loose[..., :, None] & loose[..., None, :], matrix, np.eye(len(matrix)))
+def _solution(
+        matrix: Array, gradient: Array, there: Array, loose: NDArray[np.bool_]
+) -> tuple[Array, Array]:
+    """
+    Return the steps to the optimum of a quadratic with given steps where fixed.
 
-
-def _solution(matrix: Array, gradient: Array, there: Array, loose: NDArray[np.bool_]) -> Array:
-    """Return the steps to the optimum of a quadratic with given steps where fixed."""
-    pull = np.where(loose, gradient - there @ matrix, there)
-    return np.asarray(
-        np.linalg.solve(_part(matrix, loose), pull[..., None])[..., 0], dtype=np.float64)
+    Also return the logarithms of the determinants of the varying parts of the matrix.
+    """
+    step = np.where(loose, gradient - there @ matrix, there)
+    log_det = np.empty(math.prod(loose.shape[:-1]))
+    subsets(np.ascontiguousarray(matrix), np.ascontiguousarray(loose), step, log_det)
+    return step, log_det
 
 
 def inverse(matrix: Array, sought: NDArray[np.bool_]) -> Array:
     """Return the inverse over the estimated part, 0 elsewhere; shapes (..., q) are batched."""
-    inner = np.linalg.inv(_part(matrix, sought))
+    inner = np.linalg.inv(np.where(
+        sought[..., :, None] & sought[..., None, :], matrix, np.eye(len(matrix))))
     found: Array = np.where(
         sought[..., :, None] & sought[..., None, :], 0.5 * (inner + inner.swapaxes(-1, -2)), 0.0)
     return found
@@ -280,7 +298,7 @@ def optimum(
     """
     loose = sought.copy()
     while True:
-        step = _solution(matrix, gradient, np.where(loose, 0.0, step), loose)
+        step, _ = _solution(matrix, gradient, np.where(loose, 0.0, step), loose)
         bounded = np.minimum(np.maximum(step, low), high)
         beyond = loose & (np.abs(bounded - step) > 1e-12)
         if not beyond.any():
