@@ -9,6 +9,7 @@ import pytest
 from hmsa.errors import BadInputError
 from hmsa.identification.files import read_belief
 from hmsa.model.creep import Creep
+from hmsa.motion import subsets
 from hmsa.planning.planner import Options as PlannerOptions
 from hmsa_lab.adapt.estimator import Estimator, EstimatorOptions
 from hmsa_lab.adapt.hypotheses import Evidence, Hypotheses
@@ -348,3 +349,20 @@ def test_plans_have_no_lag_where_none_was_found():
         root = 1e-3 * random.standard_normal(found.covariance.shape)
         there = replace(found, covariance=root @ root.T, off=root[0], instead=root[0])
         assert there.model(PlannerOptions()).options.coil_time_constant == 0.0
+
+
+def test_the_systems_of_subsets_are_solved_as_by_numpy():
+    random = np.random.default_rng(0)
+    root = random.standard_normal((9, 7))
+    matrix, varies = root.T @ root, random.random((40, 7)) < 0.5
+    given, log_det = random.standard_normal((40, 7)), np.empty(40)
+    found = given.copy()
+    subsets(matrix, varies, found, log_det)
+    for some, right, solved, size in zip(varies, given, found, log_det, strict=True):
+        part = matrix[np.ix_(some, some)]
+        np.testing.assert_allclose(solved[some], np.linalg.solve(part, right[some]), rtol=1e-9)
+        assert np.all(solved[~some] == right[~some])
+        assert size == pytest.approx(np.linalg.slogdet(part)[1], rel=1e-12, abs=1e-12)
+    subsets(matrix, varies[:0], found[:0], log_det[:0])
+    with pytest.raises(ValueError, match='fit each other'):
+        subsets(matrix, varies, found[:39], log_det)

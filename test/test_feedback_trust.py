@@ -232,6 +232,16 @@ def test_a_sensor_that_changes_is_named_costs_nothing_and_is_forgotten(change, m
     assert 'sensor has changed' not in it.message
 
 
+def test_a_modulus_that_jumps_is_told_from_a_sensor_in_the_next_move():
+    it = bench(False, noise=3e-3, factors={'shear_modulus': 1.1})
+    moves(it, (1.3, 1.15, 1.4))
+    it.plant.block = replace(it.plant.block, shear_modulus=1.16 * paper(False)[0].shear_modulus)
+    it.plant.solution = None
+    # With the modulus confirmed before, each of them would leave 5 %.
+    assert np.max(np.abs(moves(it, (1.2, 1.35, 1.1, 1.3)))[2:]) < 0.5
+    assert 'G about +16 %; plans use it' in it.message
+
+
 @pytest.mark.parametrize('modulus', [pytest.param(1.0, marks=pytest.mark.slow), 1.1])
 def test_a_small_bias_that_jumps_and_stays_costs_nothing(modulus):
     it = bench(False, noise=1e-3, factors={'shear_modulus': modulus})

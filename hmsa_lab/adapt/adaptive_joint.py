@@ -6,8 +6,6 @@ from dataclasses import dataclass, field, InitVar, replace
 from functools import partial
 import math
 
-import numpy as np
-
 from hmsa.errors import HmsaError
 from hmsa.identification.known import Known
 from hmsa.identification.quantities import TEMPERATURE
@@ -33,7 +31,7 @@ from hmsa_lab.adapt.messages import differences, sentence
 from hmsa_lab.adapt.motion import held, rest
 from hmsa_lab.adapt.move_errors import MoveErrors, Moves
 from hmsa_lab.adapt.prior import Prior
-from hmsa_lab.adapt.trust import shows_move, Trust
+from hmsa_lab.adapt.trust import Trust
 from hmsa_ros.runtime.records import Settings
 
 # Earlier levels that still affect the samples: the field of a coil with lag depends on them.
@@ -58,12 +56,9 @@ _LOOK = 3.0
 # time scales and coil time constants, after a change or in all. A field that is measured some ms
 # before or after the stretch differs for that long at each change of level.
 _OFF, _LEAST, _FOLLOWED = 0.05, 0.01, 3.0
-# A sensor that had changed is as before again once the standard deviation of its reading is below
-# the first value, and its change below a bias, a fraction of the stretch from rest, and some
-# standard deviations, up to the last value.
-_AGAIN, _BIAS, _ALIKE, _SURE, _MOST = 3e-3, 2e-4, 1e-3, 2.0, 1e-3
-# Log odds from which the sensor counts as changed.
-_JUMPED = 5.0
+# Log odds from which the sensor counts as changed, and part of the possible log odds against a
+# change from which it counts as before; a drift of 1e-2 a second reaches 0.73.
+_JUMPED, _AS_BEFORE = 5.0, 0.8
 # Number of samples kept to be explained anew.
 _KEPT = 600
 # Difference in K of an estimated temperature that plans follow; 2e-4 of a level.
@@ -127,7 +122,6 @@ class AdaptiveJoint:
     _thermometer: tuple[int, float] | None = None  # the newest temperature in use
     _differs: int | None = None  # timestamp since which the field differs; None if it does not
     sensor_changed: bool = False  # whether the estimator allows for any bias and gain
-    _changed: int = 0  # time at which a move has shown that it has; 0 if none has
     reverts: bool = False  # whether the plan is to be reverted to the given parameters
     _bias: tuple[float, float] = 0.0, 0.0  # of the sensor as confirmed, and its deviation
     mismatch: int = 0  # longest time in ns for which it differed, and then not any more
@@ -194,7 +188,7 @@ class AdaptiveJoint:
     @property
     def interval(self) -> int:
         """Time in ns from one update to the next."""
-        if self._still(_QUIET * self.given.units.time):
+        if self._still(_QUIET * self.given.units.time) and not self.trust.doubts:
             return RESTING
         return min(_UPDATE, round(_OFTEN * self.unit * NANOSECONDS)) * (
             _SELDOM if self._still(_RINGING * self.unit) else 1)
@@ -322,10 +316,11 @@ class AdaptiveJoint:
             # Samples that an estimate in use has fitted do not show what has changed since.
             self._restart(max(estimator.since, self._fitted) if acted and not jumped
                           else estimator.since)
-        elif found is not None and trust.acts and trust.failed:
-            self._look_at_sensor(found, now, anew=not acted)
+        elif found is not None and trust.acts and trust.failed and (
+                self._look_at_sensor(found, now, anew=not acted)):
+            found = None
         if not trouble:
-            self._fitted = self.newest
+            self._fitted = max(self._fitted, estimator.newest)
         if found is not None and not trust.why:
             self._look_at_vibration(plan, found)
         if found is not None and trust.why:
@@ -361,72 +356,54 @@ class AdaptiveJoint:
             self.sensor_changed = (left or ways)[0]
             prior = self.prior if not self.sensor_changed else Prior.of_changed_sensor(
                 model.actuator, self.settings.feedback_parameters, self._known,
-                others=model.others)
-        self._anew = healthy or bool(left)
-        self._changed = self._changed if self.sensor_changed else 0
-        if not self._anew:
+                others=model.others, bias=self._bias)
+        self._anew = bool(left) and not healthy
+        if not (healthy or left):
             self._tried.clear()
             since = self.newest + 1
         self._tried.add(self.sensor_changed)
         self._since = since
         # The level that has held the block may not have been the one commanded.
-        self.estimator.restart(self._as_warm(prior), settled=not self._anew)
+        self.estimator.restart(self._as_warm(prior), settled=not (healthy or left))
         self.trust.restarted(screening.rejected, since)
         for stamp, stretch in self._kept:
             if stamp >= since:
                 self.fresh |= self.estimator.sample(stamp, stretch)
 
-    def _look_at_sensor(self, found: StateEstimate, now: int, *, anew: bool) -> None:
-        """Decide whether the sensor has changed, after an estimate that failed; ``anew``: fits."""
-        trust = self.trust
-        if not self.sensor_changed:
-            if not differences(found, self.prior.values) and (
-                    excludes(found, trust.confirmed)
-                    if trust.confirmed is not None and self._learnt else self._is_bias(
-                        found.values['stretch_bias'],
-                        found.deviations.get('stretch_bias', 0.0))):
-                # Samples need neither what was learnt nor another sensor.
-                trust.recover(given=True)
-                self.used = self.given
-                self.reverts = not same_parameters(self.given, self.planner.base)
-                self.planner.take_model(self.given)
-            elif anew:
-                trust.wait(now)
-                self._restart(self.estimator.since)
-        elif anew and not self._changed:
-            self._changed = now
-        elif shows_move(self.planner.plan, self._changed, self.unit, now) and (
-                self._measures_as_before(found)):
-            trust.recover(given=False)
-            # With that sensor, samples have confirmed what plans use.
-            trust.confirmed = self.planner.base
-            trust.wait(now)
-            self._restart(self.estimator.since, healthy=True)
+    def _look_at_sensor(self, found: StateEstimate, now: int, *, anew: bool) -> bool:
+        """
+        Decide whether the sensor has changed, after an estimate that failed; ``anew``: it fits.
 
-    def _measures_as_before(self, found: StateEstimate) -> bool:
-        """Return whether a sensor reads the stretches of a move as before a change."""
-        places = [found.free.index(x) for x in ('stretch_bias', 'stretch_gain')]
-        rest, (bias, known) = self.prior.coordinate.rest, self._bias
-        gain, before = found.values['stretch_gain'], self.prior.values['stretch_gain']
-        for stretch in (self.start, found.stretch):
-            shift = found.values['stretch_bias'] - bias + (gain - before) * stretch
-            by = np.array([1.0, gain * stretch])
-            deviation = math.sqrt(float(by @ found.covariance[np.ix_(places, places)] @ by))
-            if deviation > _AGAIN or abs(shift) > _BIAS + _ALIKE * abs(stretch - rest) + min(
-                    _SURE * math.hypot(deviation, known), _MOST):
+        Return whether the estimator has restarted.
+        """
+        trust = self.trust
+        if self.sensor_changed:
+            plan = self.planner.plan
+            # In the middle of a move, several errors look alike.
+            if found.changed > -_AS_BEFORE or (
+                    plan.segments[plan.under_way(now)].path is None and not self.shown(now)):
                 return False
-        return True
+            trust.recover(given=False)
+            self._restart(self.estimator.since, healthy=True)
+            return True
+        if not differences(found, self.prior.values) and (
+                trust.confirmed is None or excludes(found, trust.confirmed)):
+            # Samples need neither what was learnt nor another sensor.
+            trust.recover(given=True)
+            self.used = self.given
+            self.reverts = not same_parameters(self.given, self.planner.base)
+            self.planner.take_model(self.given)
+            return False
+        if anew:
+            trust.wait(now)
+            self._restart(self.estimator.since)
+        return False
 
     @property
     def _learnt(self) -> bool:
         """Whether moves have confirmed other than the given parameters."""
         confirmed = self.trust.confirmed
         return confirmed is not None and not same_parameters(confirmed, self.given)
-
-    def _is_bias(self, value: float, deviation: float) -> bool:
-        """Return whether a bias with a standard deviation is that which moves confirmed before."""
-        before, known = self._bias
-        return abs(value - before) < _SURE * math.hypot(deviation, known) + _BIAS
 
     def confirm(self, model: JointModel) -> None:
         """Record that a move planned with a model has arrived."""

@@ -27,7 +27,7 @@ from hmsa.model.parameters import ActuatorParameters
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.timeline import ESTIMATED, JointModel
 from hmsa.planning.timeline import Options as PlannerOptions
-from hmsa_lab.adapt.hypotheses import Hypotheses
+from hmsa_lab.adapt.hypotheses import hypotheses
 from hmsa_lab.adapt.motion import follow, Levels, ModelMotion, rest
 from hmsa_lab.adapt.prior import Prior
 from hmsa_lab.adapt.screening import Screening
@@ -106,6 +106,7 @@ class StateEstimate:
     trusted: bool  # whether it may be used for plans
     trouble: str  # reason if not; else empty
     jumped: float  # log odds that the sensor has changed since the last move
+    changed: float  # relative log odds that the sensor is not as before; see `Solution`
     poor: bool  # whether the newest samples fit worse than their noise
 
     @property
@@ -198,6 +199,13 @@ class Estimator:
         """Time in ns from which levels count."""
         return self._origin
 
+    @property
+    def newest(self) -> int:
+        """Timestamp in ns of the newest sample in use; 0 for none."""
+        window = self._window
+        return 0 if window is None or not len(window.time) else (
+            self._origin + round(float(window.time[-1]) * NANOSECONDS))
+
     def count_since(self, stamp: int) -> int:
         """Return the number of samples in use from a timestamp in ns on."""
         window = self._window
@@ -253,6 +261,7 @@ class Estimator:
         self._follow_noise(found)
         estimate = self._estimate(time, found, window)
         self._go_along(window, found, until)
+        self._solution = self._solution.without_samples
         return estimate
 
     def predict(self, time: int) -> StateEstimate | None:
@@ -343,12 +352,12 @@ class Estimator:
         covariance[-2:, -2:] = np.diag(np.square([off, off * frequency]))
         window = Window(
             dict(prior.values), prior.free, np.append(mean, [stretch, 0.0]), covariance,
-            _bounds(self.prior), 0.0, np.zeros(0), np.zeros(0), Hypotheses(
+            _bounds(self.prior), 0.0, np.zeros(0), np.zeros(0), hypotheses(
                 prior.free, prior.suspects, prior.named,
-                coordinates(self.prior.values, self.prior.free),
-                1.0 / np.diag(self.prior.covariance)),
+                tuple(coordinates(self.prior.values, self.prior.free).tolist()),
+                tuple((1.0 / np.diag(self.prior.covariance)).tolist())),
             self._window.suspected if self._window else (),
-            rest=Rest(level, mean, known) if rests else None)
+            rest=Rest(level, mean, known) if rests else None, before=prior.before)
         window.settle(window.mean, _AT_REST)
         return window
 
@@ -407,7 +416,7 @@ class Estimator:
         return StateEstimate(
             time, float(state[-2]), float(state[-1]), values, self.prior.free, deviations,
             covariance, off, found.instead, doubt, window.suspects.gain, self.noise,
-            not trouble, trouble, found.jumped, found.poor)
+            not trouble, trouble, found.jumped, found.changed, found.poor)
 
     def _strange(self, z: Array) -> str:
         """Return a message on implausible parameters that samples would need; else empty."""

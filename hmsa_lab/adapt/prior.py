@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from hmsa.identification.known import Known
 from hmsa.identification.quantities import (
     check_free,
     complete,
+    coordinates,
     derivative,
     QUANTITIES,
     TEMPERATURE,
@@ -49,12 +50,29 @@ _AS_GIVEN = ('shear_modulus', 'damping_coefficient')
 # Deviations of bias and gain of a sensor that may have changed, and parameters that samples of it
 # do not determine, since they change the stretch at rest and hardly the vibration.
 _CHANGED = {'stretch_bias': 0.1, 'stretch_gain': 0.3}
+# Deviations of these about rest if the sensor is as before, that of the bias at least.
+_ALIKE = {'stretch_bias': 2e-4, 'stretch_gain': 1e-3}
+# Deviation of a bias that alone has changed, and part of it up to which one is known before.
+_JUMPED, _KNOWN = 0.05, 0.3
 _HIDDEN = ('remanence', 'chain_limit', 'constant_force')
 # Deviation in K of the temperature that is given, and the largest for its range, which leaves this
 # fraction of each parameter.
 _GIVEN, _WIDEST, _LEAST_FACTOR = 1.0, 20.0, 0.2
 # Relaxation time of a suspected branch in time scales.
 _RELAXATION = 2.0
+
+
+class SensorBefore(NamedTuple):
+    """
+    What would be known of bias and gain of a sensor that has changed less than the prior allows.
+
+    The first row is that of one that has not changed, and the second of one with another bias.
+    """
+
+    places: tuple[int, ...]  # their indices among the coordinates
+    mean: Array  # coordinates, shape (2,)
+    more: Array  # information beyond that of the prior, shape (2, 2, 2)
+    log_density: Array  # of the mean, beyond that of the prior, shape (2,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +88,7 @@ class Prior:
     spread: Array
     suspects: tuple[int, ...] = ()  # indices of suspects
     named: int = 0  # number of named quantities, which come first
+    before: SensorBefore | None = None  # of a sensor that may have changed
 
     @classmethod
     def nominal(
@@ -140,14 +159,29 @@ class Prior:
     @classmethod
     def of_changed_sensor(
             cls, actuator: ActuatorParameters, free: Sequence[str], known: Known, *,
-            others: Mapping[str, float]) -> 'Prior':
-        """Return the prior where bias and gain of the sensor may be anything; see `nominal`."""
+            others: Mapping[str, float], bias: tuple[float, float]) -> 'Prior':
+        """
+        Return the prior where bias and gain of the sensor may be anything; see `nominal`.
+
+        ``bias`` is that before, and its standard deviation.
+        """
         found = cls.nominal(
             actuator, tuple(dict.fromkeys(x for x in (*free, *_CHANGED) if x not in _HIDDEN)),
             suspects=True, others=others, deviations=_CHANGED, without=_HIDDEN)
         kept = [i for i, x in enumerate(known.names) if x not in _SENSED]
-        return found.informed(Known(
+        found = found.informed(Known(
             tuple(known.names[i] for i in kept), (), known.covariance[np.ix_(kept, kept)]))
+        found.values['stretch_bias'] = bias[0]
+        places = tuple(found.free.index(x) for x in _CHANGED)
+        # The bias before is that at rest, and the estimated one that at zero.
+        about = np.array([[1.0, found.values['stretch_gain'] * found.coordinate.rest], [0.0, 1.0]])
+        sizes = np.array([[x, _ALIKE['stretch_gain']] for x in (
+            min(math.hypot(bias[1], _ALIKE['stretch_bias']), _KNOWN * _JUMPED), _JUMPED)])
+        before = np.array([about.T @ np.diag(x ** -2) @ about for x in sizes])
+        wide = np.linalg.inv(found.covariance[np.ix_(places, places)])
+        return replace(found, before=SensorBefore(
+            places, coordinates(found.values, tuple(_CHANGED)), before - wide,
+            0.5 * (np.linalg.slogdet(before)[1] - np.linalg.slogdet(wide)[1])))
 
     @property
     def coordinate(self) -> Coordinate:

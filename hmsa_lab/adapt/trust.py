@@ -79,6 +79,11 @@ class Trust:
         return False
 
     @property
+    def doubts(self) -> bool:
+        """Whether samples no longer fit an estimate in use, which further ones may confirm."""
+        return self.acts and self._doubts > 0
+
+    @property
     def failed(self) -> bool:
         """Whether an estimate in use has failed to fit later samples."""
         return self._failures > 0

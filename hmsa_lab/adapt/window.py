@@ -22,6 +22,7 @@ from hmsa.model.equations import Array
 from hmsa.model.laws.coordinate import coordinate_of
 from hmsa_lab.adapt.hypotheses import Evidence, GAIN, Hypotheses, inverse, optimum, Others
 from hmsa_lab.adapt.motion import follow, Levels, ModelMotion, rest
+from hmsa_lab.adapt.prior import SensorBefore
 
 # Maximum Gauss-Newton iterations, halvings of each step, and small step in standard deviations.
 _PASSES, _HALVINGS, _SMALL = 4, 4, 0.1
@@ -84,7 +85,19 @@ class Solution:
     instead: Array
     doubt: BiasCase
     jumped: float = -math.inf  # log odds that the sensor jumped before the window
+    # Log odds that the sensor is not as before, if it may not be, relative to the possible ones
+    # against that.
+    changed: float = -math.inf
     poor: bool = False  # whether the samples fit worse than their noise
+
+    @property
+    def without_samples(self) -> 'Solution':
+        """The solution with the simulation at the requested time only, which is smaller."""
+        here = self.here
+        motion = replace(here.motion, **{
+            x: getattr(here.motion, x)[-1:] for x in ('stretch', 'rate', 'by', 'rate_by')})
+        return replace(self, here=here._replace(
+            motion=motion, residual=here.residual[:0], by=here.by[:0], weights=here.weights[:0]))
 
     def at_end(self) -> tuple[Array, Array, Array, BiasCase]:
         """Return coordinates and state at the requested time, their covariance and `off`."""
@@ -140,6 +153,8 @@ class Window:
     rest: Rest | None = None  # equilibrium at the begin
     first: bool = True  # whether the prior contains no samples
     jumped: float = -math.inf  # as in `Solution`, when the suspects were weighed
+    changed: float = -math.inf
+    before: SensorBefore | None = None  # of a sensor that may have changed
     information: Array = field(init=False)  # inverse of the covariance, set by `settle`
 
     def values_at(self, z: Array) -> dict[str, Any]:
@@ -232,13 +247,13 @@ class Window:
                     found = other
                 else:
                     self.suspected, self.others = before
-            self.jumped = self._sensor_jumped(found)
+            self.jumped, self.changed = self._sensor_jumped(found), self._sensor_changed(found)
         sure, off, square, instead = self.others
         doubt = self._doubt(found)
         return Solution(
             found.z, found.here, sure * inverse(found.matrix, found.loose) + square,
             np.broadcast_to(off, z.shape), np.broadcast_to(instead, z.shape), doubt, self.jumped,
-            self._is_poor(found, noise, 0.5 * float(found.gradient @ doubt.off) + (
+            self.changed, self._is_poor(found, noise, 0.5 * float(found.gradient @ doubt.off) + (
                 _SURELY * math.sqrt(0.5 * len(self.time)))))
 
     def _doubt(self, found: Optimum) -> BiasCase:
@@ -271,6 +286,26 @@ class Window:
                 - 0.5 * float((self.mean - found.z) @ pull))
             low[places], high[places] = -math.inf, math.inf
         return odds[1] - odds[0] - _RARELY
+
+    def _sensor_changed(self, found: Optimum) -> float:
+        """
+        Return the log odds that bias and gain of the sensor are not as before.
+
+        They are relative to those against another bias that agrees with the one before.
+        """
+        if self.before is None:
+            return -math.inf
+        places, mean = list(self.before.places), self.before.mean
+        off, room = found.z[places] - mean, self._room(found.z)
+        odds = [Evidence(self.suspects, found.z, found.matrix, found.gradient, *room).best()]
+        for more, log_density in zip(self.before.more, self.before.log_density, strict=True):
+            matrix, gradient = found.matrix.copy(), found.gradient.copy()
+            matrix[np.ix_(places, places)] += more
+            gradient[places] -= more @ off
+            odds.append(Evidence(self.suspects, found.z, matrix, gradient, *room).best()
+                        - 0.5 * float(off @ more @ off) + float(log_density))
+        return (max(odds[0], odds[2]) - odds[1]) / float(
+            self.before.log_density[0] - self.before.log_density[1])
 
     def _is_poor(self, found: Optimum, noise: float, more: float = 0.0) -> bool:
         """
@@ -399,4 +434,5 @@ class Window:
         return Window(
             self.values, self.free, there,
             0.5 * (covariance + covariance.T), self.bounds, begin,
-            self.time[count:], self.stretch[count:], self.suspects, self.suspected, first=False)
+            self.time[count:], self.stretch[count:], self.suspects, self.suspected, first=False,
+            before=self.before)
