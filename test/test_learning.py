@@ -18,7 +18,7 @@ from hmsa.model.parameters import paper_actuator
 from hmsa.model.simulation import simulate
 
 NOMINAL = slow(paper_actuator())
-HOLD = 0.7  # s, some six periods
+HOLD = 1.2
 SETPOINTS = ((1.15, HOLD), (1.3, HOLD), (1.05, HOLD))
 TARGETS = [TargetWindow(x, HOLD * i, HOLD * (i + 1)) for i, (x, _) in enumerate(SETPOINTS)]
 TIME = np.arange(0.0, 3.0 * HOLD, 1e-3)
