@@ -18,8 +18,11 @@ ACTUATOR = {
     'remanence': 0.1, 'chain_limit': 5.0, 'damping_coefficient': 1.0}
 GROUP = {'zeta': 0.2, 'j_lim': 5.0, 'c1': 2.0}
 RECORDS = [(ActuatorParameters, ACTUATOR), (NondimensionalParameters, GROUP)]
+# An exponent, of a compressible block.
+EXPONENT = 'transverse_mass_exponent'
 EVERY_FIELD = [
-    (record, good, field.name) for record, good in RECORDS for field in fields(record)
+    (record, good | {'bulk_ratio': 10.0} if field.name == EXPONENT else good, field.name)
+    for record, good in RECORDS for field in fields(record)
     if field.name not in ('law', 'creep', 'modes', 'thermal')]
 
 
@@ -28,6 +31,9 @@ EVERY_FIELD = [
 def test_numbers_out_of_range_are_refused_by_name(record, good, name, value):
     if value == math.inf and name in ('j_lim', 'chain_limit', 'bulk_ratio'):
         # Neo-Hookean, or of constant volume.
+        assert getattr(record(**(good | {name: value})), name) == value
+        return
+    if math.isfinite(value) and name == EXPONENT:
         assert getattr(record(**(good | {name: value})), name) == value
         return
     with pytest.raises(BadInputError, match=rf'^{name} is {value!r}: expected a finite'):
@@ -43,7 +49,7 @@ def test_what_is_no_number_is_refused_by_name(record, good, name, value):
 
 @pytest.mark.parametrize(('record', 'good', 'name'), EVERY_FIELD)
 def test_zero_is_a_damping_and_nothing_else(record, good, name):
-    if name in ('zeta', 'damping_coefficient'):
+    if name in ('zeta', 'damping_coefficient', EXPONENT):
         assert getattr(record(**(good | {name: 0})), name) == 0.0
     else:
         with pytest.raises(BadInputError, match=f'^{name} is 0: .*greater than 0'):

@@ -40,15 +40,14 @@ def _check(record: object) -> None:
             continue
         if not isinstance(value, (int, float)) or isinstance(value, bool):
             raise BadInputError(f'{name} is {value!r}: expected a number')
-        if name in _ANY_SIGN and math.isfinite(value):
-            continue
         zero, endless = name in _ZERO_ALLOWED, name in _INFINITE_ALLOWED
         # Compared first, since an integer may be too large to convert.
-        if not (0.0 < value <= sys.float_info.max or zero and value == 0.0
-                or endless and value == math.inf):
-            raise BadInputError(
-                f'{name} is {value!r}: expected a finite number '
-                f'{"of at least 0" if zero else "greater than 0"}{", or inf" if endless else ""}')
+        size = abs(value) if name in _ANY_SIGN else value
+        if not (0.0 < size <= sys.float_info.max or (
+                zero or name in _ANY_SIGN) and value == 0.0 or endless and value == math.inf):
+            least = '' if name in _ANY_SIGN else (
+                ' of at least 0' if zero else ' greater than 0') + (', or inf' if endless else '')
+            raise BadInputError(f'{name} is {value!r}: expected a finite number{least}')
         object.__setattr__(record, name, float(value))
 
 
