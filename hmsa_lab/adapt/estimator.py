@@ -455,14 +455,14 @@ class Estimator:
         drift[-2:] = _AT_REST ** 2, (_AT_REST / here.values['time_unit']) ** 2
         if self._fixed is None:
             drift[:-2] = self._drift(time - window.begin)
-        drift = self._with_rest(np.diag(drift), here.values, time)
+        wander = self._with_rest(np.diag(drift), here.values, time)
         shift = round(time * NANOSECONDS)
         seconds = shift / NANOSECONDS
         # Later motion shows how equilibrium depends on parameters.
         at = window.rest if self.learning is (self._fixed is None) and self._unchanged(
             self._origin, self._origin + shift, 0.0) else None
-        moved = window.move_on(place, time, found.z, here, self.noise, drift) if at is None else (
-            window.rest_on(at, place, time, here, self.noise, drift))
+        moved = window.move_on(place, time, found.z, here, self.noise, wander) if at is None else (
+            window.rest_on(at, place, time, here, self.noise, wander))
         self._fix(moved, found)
         if here.motion.behind:
             until_then = self._follow(found, window, time)
