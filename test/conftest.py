@@ -111,8 +111,8 @@ def pytest_runtest_makereport(
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
-    """Return three workers for two cores, since a test with nodes mostly waits for them."""
-    return max(3 * (os.cpu_count() or 1) // 2, 2)
+    """Return two workers for each core, since a test with nodes mostly waits for them."""
+    return 2 * (os.cpu_count() or 1)
 
 
 @pytest.hookimpl(wrapper=True)
