@@ -378,7 +378,7 @@ class CommandLink:
                 'it if its host has another address now'
                 if lost[0] in self.receipts.silent else
                 'though its receipts arrive: check the network in the direction from the planner '
-                'to the plant or driver')
+                'to the plant or driver, or restart it if its host has another address now')
             raise RefusedError(
                 Code.UNHEARD,
                 f'commands of joint {lost[0]} have not arrived for {passed / NANOSECONDS:.0f} s, '

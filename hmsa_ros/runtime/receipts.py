@@ -248,7 +248,9 @@ class Receipts:
             if self.lost(name):
                 return (
                     f'commands of joint {name} do not arrive: the plant or driver sends receipts, '
-                    f'but has received no command for more than {_PATIENCE / NANOSECONDS:g} s')
+                    f'but has received no command for more than {_PATIENCE / NANOSECONDS:g} s: '
+                    'the network carries one direction only, or its host has another address now '
+                    '(then restart it)')
         return ''
 
     def lag(self, joint: str) -> int | None:
