@@ -128,25 +128,25 @@ class SetpointSamples:
         """
         if self.over:
             return
-        closes, looks = self._closes, 2 * self._length
-        if closes < min(stamps) <= max(stamps) <= now + AHEAD:
+        closes, looks, newest = self._closes, 2 * self._length, max(stamps)
+        if closes < min(stamps) and newest <= now + AHEAD:
             # It only waits to be judged.
-            self._newest = max(self._newest, *stamps)
+            self._newest = max(self._newest, newest)
             return
         # Most samples are from the first looks after the arrival, in which all of them count.
         first, last = max(self.asked, self._begin), self._begin + looks
         last = min(closes if closes - looks <= last else last, now + AHEAD)
         if self._cut is not None:
             last = min(last, self._cut - 1)
-        samples, newest = self._samples, 0
+        samples = self._samples
         for stamp, stretch in zip(stamps, stretches, strict=True):
             if first <= stamp <= last:
                 samples.setdefault(stamp, stretch)
-                newest = max(newest, stamp)
             else:
                 self._add(stamp, stretch, now, steady)
-        self._hear(newest, steady)
-        self._newest = max(self._newest, newest)
+        counted = max((x for x in stamps if first <= x <= last), default=0)
+        self._hear(counted, steady)
+        self._newest = max(self._newest, counted)
 
     def _add(self, stamp: int, stretch: float, now: int, steady: int) -> None:
         """Add a sample of any time."""
