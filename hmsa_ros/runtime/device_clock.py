@@ -78,11 +78,6 @@ class DeviceClock:
         """Smallest time from a command to its receipt; 0 if unknown."""
         return 2 * self._best.error if self._exchanges else 0
 
-    @property
-    def doubtful(self) -> bool:
-        """Whether the last measurement contradicts the earlier ones."""
-        return self._doubt is not None
-
     def sent(self, stamp: int, now: int) -> None:
         """Record that a command was sent; timestamp and time of the planner's clock."""
         self._sent[stamp] = now
