@@ -21,7 +21,7 @@ from hmsa.interfaces.parameters import (
 )
 from hmsa.model.equations import Array
 from hmsa.model.laws import LAWS
-from hmsa.model.moves import impossible
+from hmsa.model.moves import check_target
 
 #: Arguments of `Actuator` of which one describes the damping.
 DAMPED = ('zeta', 'damping_ratio', 'damping_coefficient')
@@ -148,8 +148,7 @@ def setpoints_of(value: Any, rest: float) -> tuple[Array, Array]:
     """
     stretches, durations = columns_of(value, ('stretch', 'duration'), 'setpoints')
     for stretch, duration in zip(stretches.tolist(), durations.tolist(), strict=True):
-        if reason := impossible(stretch, rest):
-            raise BadInputError(reason)
+        check_target(stretch, rest)
         if not duration > 0.0:
             raise BadInputError(f'duration is {duration:g} s: expected a number greater than 0')
     if np.any(np.isinf(durations[:-1])):

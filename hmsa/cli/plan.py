@@ -167,7 +167,7 @@ def _without_dimension(arguments: argparse.Namespace) -> int:
     """Plan in the units of the paper."""
     from hmsa.api.plan import table_of
     from hmsa.model.equations import signed_root
-    from hmsa.model.moves import impossible, Setpoint, State
+    from hmsa.model.moves import check_target, Setpoint, State
     from hmsa.model.status import Code, RefusedError
     from hmsa.model.units import Units
     from hmsa.planning.sequence import plan_sequence
@@ -183,8 +183,7 @@ def _without_dimension(arguments: argparse.Namespace) -> int:
             'tesla')
     group = _group(arguments)
     for stretch, _ in arguments.setpoints:
-        if reason := impossible(stretch, group.rest):
-            raise BadInputError(reason)
+        check_target(stretch, group.rest)
     errors = _errors(arguments)
     try:
         segments = plan_sequence(

@@ -10,13 +10,13 @@ from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import Units
 
 
-def impossible(stretch: float, rest: float) -> str:
-    """Return why a stretch is impossible for an actuator with this rest; empty if possible."""
-    if math.isfinite(stretch) and (stretch > 0.0 or rest == 0.0):
-        return ''
-    more = ' greater than 0' if rest else ''
-    name = (STRETCH if rest else DEFLECTION).name
-    return f'{name} is {stretch:g}: expected a finite number{more}'
+def check_target(stretch: float, rest: float) -> None:
+    """Raise `RefusedError` if a stretch is impossible for an actuator with this rest."""
+    if not math.isfinite(stretch) or stretch <= 0.0 < rest:
+        more = ' greater than 0' if rest else ''
+        name = (STRETCH if rest else DEFLECTION).name
+        raise RefusedError(
+            Code.BAD_INPUT, f'{name} is {stretch:g}: expected a finite number{more}')
 
 
 @dataclass(frozen=True)

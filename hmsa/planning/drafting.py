@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from hmsa.errors import BadInputError
-from hmsa.model.moves import impossible, Level, Move, Setpoint, State
+from hmsa.model.moves import check_target, Level, Move, Setpoint, State
 from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.history import agree
@@ -92,12 +92,6 @@ def check_times(
                 + (f' after {previous / NANOSECONDS:g} s: expected strictly increasing '
                    'times' if number else ': expected at least 0 s'))
         previous = time
-
-
-def check_target(stretch: float, rest: float) -> None:
-    """Raise `RefusedError` if the stretch is impossible for an actuator with this rest."""
-    if reason := impossible(stretch, rest):
-        raise RefusedError(Code.BAD_INPUT, reason)
 
 
 def draft_sequence(

@@ -13,7 +13,7 @@ import math
 
 from hmsa.errors import BadInputError
 from hmsa.model.equations import equilibrium_stretch
-from hmsa.model.moves import Setpoint
+from hmsa.model.moves import check_target, Setpoint
 from hmsa.model.parameters import ActuatorParameters
 from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import NANOSECONDS
@@ -238,7 +238,7 @@ class Planner(RunningPlan):
 
     def draft_setpoint(self, stretch: float, now: int) -> Draft | None:
         """Draft a move to one stretch; None if it changes nothing."""
-        drafting.check_target(stretch, self.model.rest)
+        check_target(stretch, self.model.rest)
         begin = self.soonest(now)
         if self.plan.ends_at(stretch, begin):
             return None
@@ -312,7 +312,8 @@ class Planner(RunningPlan):
         anew = model is None
         if model is None:
             model, believed = self.model, self.believed(begin + self.delay)
-        state = model.taken_from(self._delayed(begin), self.model)
+        state = model.taken_from(
+            self._delayed(begin) if self.delay else self.state(begin), self.model)
         if believed is not None:
             state = replace(
                 state, stretch=believed[0], rate=believed[1] * model.units.time,
