@@ -105,7 +105,7 @@ class NondimensionalParameters:
     @cached_property
     def creeps(self) -> bool:
         """Whether there are viscoelastic branches with a stiffness above 0."""
-        return bool(self.creep)
+        return len(self.branches) > 0
 
     @cached_property
     def limits(self) -> tuple[float, float]:

@@ -135,7 +135,7 @@ def with_followed(
 def observed(rows: Array, material: NondimensionalParameters) -> Array:
     """Return stretch and rate of all modes together from rows of `sampled`, shape (2, m)."""
     seen = rows[:motion.FIELD]
-    if not material.modes:
+    if not material.modes.ratios:
         return seen
     after = motion.FOLLOWED + len(material.branches)
     return np.array(material.observed(seen[0], seen[1], rows[after:]))
@@ -196,7 +196,8 @@ def _sampled(
         material: NondimensionalParameters, lag: float = 0.0, rtol: float = RTOL) -> Array:
     switches, loads, slopes = np.array(pieces).T.copy()
     branches = material.rows.copy()
-    branches[:, motion.FOLLOWER] = followed_by(state, material)
+    if len(branches):
+        branches[:, motion.FOLLOWER] = followed_by(state, material)
     out = np.empty((motion.FOLLOWED + len(branches), times.size))
     if not motion.sample(
             state.stretch, state.rate, loads[0] if math.isnan(state.load) else state.load,
@@ -259,7 +260,7 @@ def longest_motion(load: float, material: NondimensionalParameters) -> float:
     frequency = law.natural_frequency(stretch, material.packed)
     longest = _MOST_PERIODS * 2.0 * math.pi / frequency
     decay = law.damping(stretch, material.packed) / (2.0 * law.mass(stretch, material.packed))
-    if material.modes:
+    if material.modes.ratios:
         decay = min(decay, frequency * material.modes.slowest_decay())
     if decay == 0.0:
         return longest

@@ -305,8 +305,6 @@ class RunningPlan:
 
     def _delayed(self, time: int) -> State:
         """Predict the state `delay` after a time in ns, with future levels late by `delay`."""
-        if not self.delay:
-            return self.state(time)
         state, rest = self.unknown(ALWAYS)
         late = [x for x in rest[:_REMEMBERED + 1] if x.stamp <= time]
         if len(late) > _REMEMBERED:

@@ -78,13 +78,13 @@ def _percent(fraction: float) -> str:
 
 def remaining(request: MoveRequest, move: Move) -> Remaining | None:
     """
-    Return what a move leaves; None without secondary modes, and if `modal` brings all to rest.
+    Return what a move with secondary modes leaves; None if it is less than is told.
 
-    A move that only approaches its target has none either, unless secondary modes vibrate.
+    `modal` may bring all modes to rest.
     """
     modes = request.material.modes
     size = abs(request.target - request.state.stretch)
-    if not modes or size < _LEAST_MOVE or move.code is Code.HOLD or (
+    if size < _LEAST_MOVE or move.code is Code.HOLD or (
             move.code is Code.MODAL and request.material.ringing is request.material):
         return None
     half = math.pi / request.frequency
@@ -243,7 +243,7 @@ def segments(
         yield Segment(
             setpoint, begin, state, end, move,
             float(law.elastic_force(setpoint.stretch, frame.material.packed)),
-            remaining(request, move))
+            remaining(request, move) if frame.material.modes.ratios else None)
         begin += setpoint.span
         state = end
         setpoint = following
