@@ -203,8 +203,7 @@ def test_a_level_that_was_dropped_after_its_acknowledgement_is_not_carried_out()
     time = 0
     receipts = Receipts(lambda: time)
     receipts.received('a', time, 0, time, comparable=True)
-    receipts.sent('a', 50 * MS, time)
-    receipts.expect('a', 50 * MS)
+    receipts.sent('a', 50 * MS, time, level=True)
     assert receipts.owed('a')
     time = 60 * MS
     receipts.received('a', time, 50 * MS, time, comparable=True)

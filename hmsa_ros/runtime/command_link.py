@@ -88,14 +88,15 @@ class CommandLink:
             self._void.discard(name)
             for level in planner.due(_FAR if everything else now):
                 self.fresh.discard(name)
-                self._hand_out(name, level.stamp, level.flux_density, now)
-                self.receipts.expect(name, level.stamp)
+                self._hand_out(name, level.stamp, level.flux_density, now, level=True)
                 self.sent += 1
                 self._deviations.sent(name, level.stamp, now)
 
-    def _hand_out(self, name: str, stamp: int, flux_density: float, now: int) -> None:
+    def _hand_out(
+            self, name: str, stamp: int, flux_density: float, now: int, *,
+            level: bool = False) -> None:
         self.deliver(Send(name, stamp, flux_density))
-        self.receipts.sent(name, stamp, now)
+        self.receipts.sent(name, stamp, now, level=level)
 
     def beat(self, now: int, *, finds_lost: bool) -> None:
         """
@@ -350,11 +351,11 @@ class CommandLink:
         for joint in self.cut:
             self.acknowledge(joint)
         # After a loss, a heartbeat shows whether commands arrive again.
-        lost = [x for x in self._planners if self.receipts.lost(
-            x, *((0,) if x in self.cut or self._deviations.lost(x) else ()))]
+        lost = next((x for x in self._planners if self.receipts.lost(
+            x, *((0,) if x in self.cut or self._deviations.lost(x) else ()))), '')
         # Asking the middleware takes far longer than looking up.
         owed = any(
-            not self.receipts.knows(x) and self._around.reports(x) for x in self._planners)
+            x not in self.receipts.joints and self._around.reports(x) for x in self._planners)
         if not (lost or self.cut or owed) and all(
                 level[1] != 0.0 or self.receipts.since(name, level[0])
                 for name, level in self._deviations.newest.items() if name in names):
@@ -376,12 +377,12 @@ class CommandLink:
             how = (
                 'and no receipts either: start the plant or driver, check the network, or restart '
                 'it if its host has another address now'
-                if lost[0] in self.receipts.silent else
+                if lost in self.receipts.silent else
                 'though its receipts arrive: check the network in the direction from the planner '
                 'to the plant or driver, or restart it if its host has another address now')
             raise RefusedError(
                 Code.UNHEARD,
-                f'commands of joint {lost[0]} have not arrived for {passed / NANOSECONDS:.0f} s, '
+                f'commands of joint {lost} have not arrived for {passed / NANOSECONDS:.0f} s, '
                 f'{how}, and send the request again')
         return True
 

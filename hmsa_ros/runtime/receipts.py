@@ -57,37 +57,38 @@ class Receipts:
     """
     Track receipts, which are optional: only their absence after the first one is an alarm.
 
-    ``silent`` contains the joints whose device has stopped sending receipts.
+    ``joints`` contains the joints whose device gives receipts, and ``silent`` those whose device
+    has stopped sending them.
     """
 
     def __init__(self, steady: Callable[[], int]) -> None:
         self._steady = steady
-        self._joints: dict[str, _Receiver] = {}
+        self.joints: dict[str, _Receiver] = {}
         self._looked = steady()
         self._disturbances: deque[Disturbance] = deque(maxlen=_REMEMBERED)
         self.silent: set[str] = set()
 
     def __bool__(self) -> bool:
-        return bool(self._joints)
+        return bool(self.joints)
 
-    def sent(self, joint: str, stamp: int, now: int) -> None:
-        """Record that a command was sent; timestamp and time in ns of the planner's clock."""
-        known = self._joints.get(joint)
+    def sent(self, joint: str, stamp: int, now: int, *, level: bool = False) -> None:
+        """
+        Record that a command was sent; timestamp and time in ns of the planner's clock.
+
+        A new ``level`` is to be acknowledged itself, rather than a heartbeat.
+        """
+        known = self.joints.get(joint)
         if known is None:
             return
         if known.unanswered is None:
             known.unanswered = self._steady()
-        known.clock.sent(stamp, now)
-
-    def expect(self, joint: str, stamp: int) -> None:
-        """Expect the acknowledgement of a level that was sent, rather than of a heartbeat."""
-        known = self._joints.get(joint)
-        if known is not None:
+        if level:
             known.level = stamp
+        known.clock.sent(stamp, now)
 
     def owed(self, joint: str) -> bool:
         """Return whether a joint's device has not acknowledged the newest level."""
-        known = self._joints.get(joint)
+        known = self.joints.get(joint)
         return known is not None and known.level is not None
 
     def received(
@@ -103,9 +104,9 @@ class Receipts:
         paused. A device has restarted if it reports no command after it reported one.
         """
         steady = self._steady()
-        known = self._joints.get(joint)
+        known = self.joints.get(joint)
         if known is None:
-            known = self._joints[joint] = _Receiver(steady)
+            known = self.joints[joint] = _Receiver(steady)
         if known.silent and comparable and known.is_delayed(time, steady):
             return False
         if steady - known.arrived > _STALE:
@@ -132,16 +133,12 @@ class Receipts:
             known.step += known.clock.received(time, command, now, steady)
         return restarted
 
-    def knows(self, joint: str) -> bool:
-        """Return whether there was a receipt of a joint."""
-        return joint in self._joints
-
     def _disturbed(self, begin: int, words: str) -> None:
         self._disturbances.append(Disturbance(begin, self._steady(), words))
 
     def take_disturbances(self) -> list[Disturbance]:
         """Return the disturbances since the last call, and those that last."""
-        for name, known in self._joints.items():
+        for name, known in self.joints.items():
             if (silence := self._steady() - known.arrived) > _STALE:
                 self._disturbed(known.arrived, _outage(name, silence))
         found = list(self._disturbances)
@@ -150,19 +147,14 @@ class Receipts:
 
     def void(self, joint: str) -> None:
         """Expect no acknowledgement of the commands sent so far, since they are rejected."""
-        known = self._joints.get(joint)
+        known = self.joints.get(joint)
         if known is not None:
             known.clock.lost()
             known.unanswered = known.level = None
 
-    @property
-    def joints(self) -> set[str]:
-        """Joints whose device gives receipts."""
-        return {*self._joints}
-
     def since(self, joint: str, time: int) -> bool:
         """Return whether a joint's newest receipt is no older than a time of its device."""
-        known = self._joints.get(joint)
+        known = self.joints.get(joint)
         return known is None or known.silent or known.time >= time
 
     def carried_out(self, joint: str, stamp: int) -> bool | None:
@@ -171,7 +163,7 @@ class Receipts:
 
         A newer command acknowledges it too. None if the device sends no receipts.
         """
-        known = self._joints.get(joint)
+        known = self.joints.get(joint)
         return None if known is None else (
             not known.silent and known.acknowledged >= stamp and known.time >= stamp)
 
@@ -181,24 +173,24 @@ class Receipts:
 
         Only repeated calls take effect, because discovery finds one topic after the other.
         """
-        known = self._joints.get(joint)
+        known = self.joints.get(joint)
         if known is None:
             return
         known.missing += 1
         if known.missing >= _MISSING:
-            del self._joints[joint]
+            del self.joints[joint]
             self.silent.discard(joint)
 
     def clock_set(self) -> None:
         """Record that the planner's clock was set."""
         self._disturbed(self._steady() - _STALE, 'the clock of the planner was set')
-        for known in self._joints.values():
+        for known in self.joints.values():
             known.clock.set(self._steady())
             known.acknowledged, known.level = 0, None
 
     def take_step(self, joint: str) -> int:
         """Return by how many ns a device's clock was set ahead since the last call."""
-        known = self._joints.get(joint)
+        known = self.joints.get(joint)
         if known is None:
             return 0
         step, known.step = known.step, 0
@@ -212,7 +204,7 @@ class Receipts:
         if absent > _PAUSE:
             self._disturbed(
                 steady - absent, f'the planner stood still for {absent / NANOSECONDS:.3f} s')
-        for name, known in self._joints.items():
+        for name, known in self.joints.items():
             if absent > _PAUSE:
                 known.arrived = min(known.arrived + absent, steady)
                 if known.unanswered is not None:
@@ -221,12 +213,12 @@ class Receipts:
             if silent is not known.silent:
                 changed.append(name)
                 known.silent = silent
-        self.silent = {x for x, known in self._joints.items() if known.silent}
+        self.silent = {x for x, known in self.joints.items() if known.silent}
         return changed
 
     def lost(self, joint: str, patience: int = _PATIENCE) -> bool:
         """Return whether a command has been unacknowledged for longer than ``patience`` in ns."""
-        known = self._joints.get(joint)
+        known = self.joints.get(joint)
         return known is not None and known.unanswered is not None and (
             self._steady() - known.unanswered > patience)
 
@@ -238,7 +230,7 @@ class Receipts:
     @property
     def words(self) -> str:
         """Why commands do not arrive; empty if they do or if there are no receipts."""
-        for name, known in self._joints.items():
+        for name, known in self.joints.items():
             if known.silent:
                 return (
                     f'no receipt of joint {name} from the plant or driver for more than '
@@ -255,23 +247,23 @@ class Receipts:
 
     def lag(self, joint: str) -> int | None:
         """Return the smallest age in ns of a joint's receipts at arrival; None for no receipt."""
-        known = self._joints.get(joint)
+        known = self.joints.get(joint)
         return None if known is None else known.clock.lag
 
     def is_past(self, joint: str, time: int, now: int) -> bool:
         """Return whether a time of a device can have passed by one of the planner's clock."""
-        known = self._joints.get(joint)
+        known = self.joints.get(joint)
         return known is None or known.clock.is_past(time, now)
 
     def offset_of(self, joint: str) -> Offset | None:
         """Return the clock offset of a joint's device; None if unknown."""
-        known = self._joints.get(joint)
+        known = self.joints.get(joint)
         return None if known is None else known.clock.offset
 
     @property
     def offset(self) -> Offset | None:
         """Largest clock offset among the devices; None if unknown."""
-        found = (x.clock.offset for x in self._joints.values())
+        found = (x.clock.offset for x in self.joints.values())
         return max((x for x in found if x is not None), key=lambda x: abs(x.ahead), default=None)
 
 

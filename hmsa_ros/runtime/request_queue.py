@@ -68,40 +68,38 @@ class RequestQueue:
         #: Temperatures of the joints, for which plans are made.
         self.temperatures = temperatures
         self._around, self._send, self._stopping = environment, send, stopping
-        self._queue: deque[PlanningTask] = deque()
+        #: What waits, in the order of planning.
+        self.tasks: deque[PlanningTask] = deque()
         # Parts of replaced plans: freeing all at once takes tens of ms.
         self._leftovers: list[object] = []
         self.refused = 0
 
     def __bool__(self) -> bool:
-        return bool(self._queue or self._leftovers)
+        return bool(self.tasks or self._leftovers)
 
     @property
     def requests(self) -> list[Request]:
         """Requests that have no result yet."""
-        return [x.request for x in self._queue if x.request is not None]
+        return [x.request for x in self.tasks if x.request is not None]
 
     @property
     def upcoming(self) -> Request | None:
         """The request that is planned next; None for none."""
-        return next((x.request for x in self._queue if x.request is not None), None)
+        return next((x.request for x in self.tasks if x.request is not None), None)
 
     def refuse_all(self, error: HmsaError) -> None:
         """Refuse all waiting requests for the same reason."""
-        for work in list(self._queue):
+        for work in list(self.tasks):
             if work.request is not None:
                 work.abandon()
-                self._queue.remove(work)
+                self.tasks.remove(work)
                 self.refuse(error, work.request)
-
-    def __contains__(self, work: PlanningTask) -> bool:
-        return work in self._queue
 
     def clear(self) -> None:
         """Drop all waiting work."""
-        for work in self._queue:
+        for work in self.tasks:
             work.abandon()
-        self._queue.clear()
+        self.tasks.clear()
         self._leftovers.clear()
 
     def add(self, request: Request, *, engaged: bool) -> PlanningTask:
@@ -114,18 +112,18 @@ class RequestQueue:
         else:
             work = PlanningTask(
                 frozenset(self._group.planners), at_once=self._group.draft_stop, request=request)
-        if engaged and work.replaces(self._queue):
-            self._queue.appendleft(work)
+        if engaged and work.replaces(self.tasks):
+            self.tasks.appendleft(work)
         else:
-            self._queue.append(work)
+            self.tasks.append(work)
         return work
 
     def _supersede(self, work: PlanningTask) -> None:
         """Drop earlier requests that this one would replace as soon as they are planned."""
-        for old in list(self._queue):
+        for old in list(self.tasks):
             if old.number < work.number and old.joints <= work.joints and not work.postponed:
                 old.abandon()
-                self._queue.remove(old)
+                self.tasks.remove(old)
                 if old.request is not None:
                     self._reporting.give(Verdict(
                         Severity.WARN, Code.SUPERSEDED, 'another request came before this one was '
@@ -134,17 +132,17 @@ class RequestQueue:
     def work_on(self) -> None:
         """Wait for the plans of waiting work, for the duration of a slice."""
         for name in self._deviations.to_resume() if self._deviations.astray else ():
-            if not any(x.request is None and name in x.joints for x in self._queue):
-                self._queue.appendleft(self._deviations.resumption(name))
-        if not self._queue:
-            self._queue += self.follower.due(self._around.clock())
-            self._queue += self.temperatures.due(self._around.clock())
+            if not any(x.request is None and name in x.joints for x in self.tasks):
+                self.tasks.appendleft(self._deviations.resumption(name))
+        if not self.tasks:
+            self.tasks += self.follower.due(self._around.clock())
+            self.tasks += self.temperatures.due(self._around.clock())
         del self._leftovers[-_FREED:]
         end = self._around.steady() + SLICE
-        while self._queue and (left := end - self._around.steady()) > 0:
-            work = self._queue[0]
-            if self.advance(work, left) and work in self._queue:
-                self._queue.remove(work)
+        while self.tasks and (left := end - self._around.steady()) > 0:
+            work = self.tasks[0]
+            if self.advance(work, left) and work in self.tasks:
+                self.tasks.remove(work)
         while self._deviations.verdicts:
             self._reporting.go_on(self._deviations.verdicts.pop(0))
 

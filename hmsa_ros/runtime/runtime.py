@@ -169,7 +169,7 @@ class Runtime:
         self._engage(begin=True)
         while self._may_plan():
             self.planning.work_on()
-            if work not in self.planning or isinstance(request, Trajectory):
+            if work not in self.planning.tasks or isinstance(request, Trajectory):
                 # Else, it is short work, and the caller waits for it.
                 break
         if self._set_back:
@@ -178,7 +178,7 @@ class Runtime:
         if isinstance(request, Stop) and self.devices.apart:
             # What was to stop is dropped already, and no command reaches the device in time.
             return self.planning.refuse(self.devices.differs(min(self.devices.apart)), request)
-        return _WAITING if work in self.planning else self._reporting.verdict
+        return _WAITING if work in self.planning.tasks else self._reporting.verdict
 
     def _compare_samples(self, request: Trajectory | StretchRequest) -> None:
         """Have joints that are to move now compared with their samples."""
@@ -471,7 +471,7 @@ class Runtime:
             self._next_service = None
         if stall > _STALL and self._takeover.engaged and (
                 stall > _LOST * (self.settings.heartbeat_period or math.inf) or self._overdue):
-            self._unheard = self.devices.receipts.joints
+            self._unheard = {*self.devices.receipts.joints}
             self._listens_until = steady + _SETTLE, steady + _OWED
             self._note(
                 f'the planner stood still for {stall / NANOSECONDS:.3f} s: it reads what plant '
