@@ -7,32 +7,31 @@ import sys
 
 import pytest
 
-# V. L. Biderman, Calculation of rubber parts, Mashgiz, Moscow (1958).
+# H. Demiray, J. Biomech. 5, 309 (1972), and a term of A. N. Gent, A. G. Thomas, J. Polym. Sci. 28,
+# 625 (1958): no other model has their functions.
 MODULE = """
-from hmsa.model.laws.record import Constant, Law, polynomial, positive_modulus
+from hmsa.model.laws.formula import expm1, law_of, log1p
+from hmsa.model.laws.record import Constant
 
 
-def _scaled(values):
-    one, second, two, three = factors = tuple(float(values[x.name]) for x in LAW.constants)
-    modulus = positive_modulus(LAW.name, 2.0 * (one + second), '2 (b10 + b01)', factors)
-    return modulus, polynomial(LAW, values, modulus, (one, two, three), second)
+def _energy(strain, mu, b, c2):
+    return 0.5 * mu / b * expm1(b * strain.first) + c2 * log1p(strain.second / 3.0)
 
 
-LAW = Law(
-    'biderman', 'b10 (I1 - 3) + b01 (I2 - 3) + b20 (I1 - 3)^2 + b30 (I1 - 3)^3', 'Biderman 1958',
-    (Constant('law.b10', 'factor of I1 - 3', place=1),
-     Constant('law.b01', 'factor of I2 - 3', place=0),
-     Constant('law.b20', 'factor of (I1 - 3)^2', place=2),
-     Constant('law.b30', 'factor of (I1 - 3)^3', place=3)), _scaled)
+LAW = law_of(
+    'exponential', 'mu/(2 b) (exp(b (I1 - 3)) - 1) + c2 ln(I2/3)', 'Demiray 1972',
+    (Constant('law.mu_d', 'modulus', minimum=0.0),
+     Constant('law.b', 'stiffening', '', minimum=0.0, above=0.0),
+     Constant('law.c2', 'factor of the second invariant')), _energy)
 """
 
 USED = """
 import json
 
-import biderman
+import exponential
 from hmsa.model.laws import LAWS
 
-LAWS[biderman.LAW.name] = biderman.LAW
+LAWS[exponential.LAW.name] = exponential.LAW
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -43,8 +42,8 @@ from hmsa.interfaces.parameters import PLANNED
 from hmsa.model.actuators import Setup
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 
-CONSTANTS = {'b10': 4e3, 'b01': 1e3, 'b20': 200.0, 'b30': 30.0}
-block = hmsa.Actuator(law='biderman', constants=CONSTANTS)
+CONSTANTS = {'mu_d': 8e3, 'b': 0.4, 'c2': 3e3}
+block = hmsa.Actuator(law='exponential', constants=CONSTANTS)
 plan = block.plan([(1.3, 0.2), (0.9, 0.2)])
 block.to_yaml('block.yaml')
 again = hmsa.Actuator.from_yaml('block.yaml')
@@ -53,13 +52,13 @@ assert again == block
 # Its plan, in an equation of motion that is typed here.
 group = block.block.nondimensional
 unit, load = block.block.time_unit, block.block.flux_density_unit
-c10, c01, c20, c30 = (x / 1e4 for x in CONSTANTS.values())
+mu, b, c2 = (CONSTANTS[x] / y for x, y in (('mu_d', 1e4), ('b', 1.0), ('c2', 1e4)))
 
 
 def slope(_, y, beta):
     l, v = y
-    i1, by1, by2 = l * l + 2 / l - 3, 2 * l - 2 / l ** 2, 2 - 2 / l ** 3
-    force = (c10 + 2 * c20 * i1 + 3 * c30 * i1 ** 2) * by1 + c01 * by2
+    force = mu / 2 * np.exp(b * (l * l + 2 / l - 3)) * (2 * l - 2 / l ** 2) + (
+        c2 * (2 - 2 / l ** 3) / (2 * l + l ** -2))
     return v, 6 * (beta - force - group.zeta * group.c1 / 2 * v + v * v / (4 * l ** 4)) / (
         l ** -3 + group.c1)
 
@@ -86,10 +85,10 @@ device.advance(10 ** 9 + round(0.19e9))
 levels = [(0.0, 0.0), (0.02, 0.09), (0.12, -0.06), (0.22, 0.05), (0.32, 0.0)]
 recorded = block.simulate(levels, until=0.42, noise=1e-4)
 start = hmsa.Actuator(
-    law='biderman', constants={**CONSTANTS, 'b10': 4.4e3, 'b20': 0.0}).replace(density=1900.0)
+    law='exponential', constants={**CONSTANTS, 'mu_d': 8.8e3, 'b': 0.3}).replace(density=1900.0)
 found = hmsa.identify(
     (recorded.times, recorded.stretches), levels, actuator=start,
-    free=['law.b10', 'law.b20', 'damping_coefficient', 'stretch_bias'])
+    free=['law.mu_d', 'law.b', 'damping_coefficient', 'stretch_bias'])
 found.report('identified.html')
 plan.simulate().report('run.html')
 status = main(['plan', '1.2:0.2', '--params-file', 'block.yaml', '--json'])
@@ -97,17 +96,17 @@ print()
 print(json.dumps({
     'off': [float(x) for x in (*(at_first - (1.3, 0.0)), *(at_end - (0.9, 0.0)))],
     'device': float(device.stretch[0]), 'verdict': found.verdict, 'status': status,
-    'b10': found.actuator.parameters['law.b10'], 'b20': found.actuator.parameters['law.b20'],
-    'declared': [x.name for x in PLANNED if x.name.startswith('law.b')],
+    'mu': found.actuator.parameters['law.mu_d'], 'b': found.actuator.parameters['law.b'],
+    'declared': [x.name for x in PLANNED if x.name.startswith('law.')],
     'pages': [y in open(x).read() for x, y in (
-        ('identified.html', 'b20'), ('run.html', 'biderman'))]}))
+        ('identified.html', 'law.b'), ('run.html', 'exponential'))]}))
 """
 
 
 @pytest.fixture(scope='module')
 def used(tmp_path_factory):
     folder = tmp_path_factory.mktemp('law')
-    (folder / 'biderman.py').write_text(MODULE)
+    (folder / 'exponential.py').write_text(MODULE)
     (folder / 'used.py').write_text(USED)
     done = subprocess.run(
         [sys.executable, 'used.py'], cwd=folder, capture_output=True, text=True, check=False,
@@ -123,12 +122,12 @@ def test_its_plans_are_those_of_an_equation_of_motion_that_is_typed_again(used):
 
 
 def test_nodes_and_files_have_its_constants(used):
-    assert {'law.b10', 'law.b01', 'law.b20', 'law.b30'} <= set(used['declared'])
+    assert {'law.mu_d', 'law.b', 'law.c2'} <= set(used['declared'])
     assert used['device'] == pytest.approx(1.3, abs=1e-6)
 
 
 def test_it_is_identified_and_reported(used):
     assert used['verdict'] == 'identified'
-    assert used['b10'] == pytest.approx(4e3, rel=5e-3)
-    assert used['b20'] == pytest.approx(200.0, abs=20.0)
+    assert used['mu'] == pytest.approx(8e3, rel=5e-3)
+    assert used['b'] == pytest.approx(0.4, rel=0.05)
     assert used['pages'] == [True, True]

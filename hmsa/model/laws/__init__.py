@@ -1,7 +1,8 @@
 """
 Hyperelastic models: a table, and one module for each model with its constants and source.
 
-These modules are not compiled; forces and energies are in `hmsa/motion/hmsa/law.hpp`.
+An energy is a function in Python (`hmsa.model.laws.formula`) or compiled in
+`hmsa/motion/hmsa/law.hpp`, where it is faster.
 """
 
 from hmsa.model.laws import (

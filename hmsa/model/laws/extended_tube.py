@@ -1,36 +1,23 @@
 """Extended tube: cross-linked chains of finite length in tubes of their neighbours."""
 
-from collections.abc import Mapping
-from typing import Any
-
-from hmsa.model.laws.record import (
-    above,
-    Constant,
-    Elastic,
-    EXTENDED_TUBE,
-    Law,
-    network,
-    positive_modulus,
-)
+from hmsa.model.laws.formula import expm1, law_of, log, log1p, Strain, Term
+from hmsa.model.laws.record import Constant
 
 
-def _scaled(values: Mapping[str, Any]) -> tuple[float, Elastic]:
-    gc, ge, delta, beta = (float(values[x.name]) for x in LAW.constants)
-    above(LAW.name, 'law.beta', beta, 0.0)
-    modulus = positive_modulus(
-        LAW.name, gc * (1.0 - 2.0 * delta**2) + ge, 'gc (1 - 2 delta^2) + ge',
-        (gc, ge, delta, beta))
-    return modulus, network(
-        LAW, EXTENDED_TUBE, values, modulus, (delta, beta), 1.0 / max(delta, 1e-6)**2)
+def _energy(strain: Strain, gc: Term, ge: Term, delta: Term, beta: Term) -> Term:
+    d = delta ** 2
+    chains = (1.0 - d) * strain.first / (1.0 - d * strain.first) + log1p(-d * strain.first)
+    tubes = strain.over_stretches(lambda x: expm1(-beta * log(x)))
+    return 0.5 * gc * chains + 2.0 * ge / beta ** 2 * tubes
 
 
-LAW = Law(
+LAW = law_of(
     'extended_tube',
     'gc/2 ((1 - delta^2) (I1 - 3)/(1 - delta^2 (I1 - 3)) + ln(1 - delta^2 (I1 - 3))) '
     '+ 2 ge/beta^2 sum (l_i^-beta - 1)',
     'M. Kaliske, G. Heinrich, Rubber Chem. Technol. 72, 602 (1999), doi:10.5254/1.3538822',
-    (Constant('law.gc', 'modulus of the cross-links', minimum=0.0, place=0),
-     Constant('law.ge', 'modulus of the entanglements', minimum=0.0, place=1),
-     Constant('law.delta', 'inextensibility of the chains', '', minimum=0.0, maximum=1.0, place=2),
+    (Constant('law.gc', 'modulus of the cross-links', minimum=0.0),
+     Constant('law.ge', 'modulus of the entanglements', minimum=0.0),
+     Constant('law.delta', 'inextensibility of the chains', '', minimum=0.0, maximum=1.0),
      Constant('law.beta', 'release of the tubes, from 0 to 1', '', minimum=0.0, maximum=1.0,
-              place=3)), _scaled)
+              above=0.0)), _energy)

@@ -1,34 +1,21 @@
 """Nonaffine network: cross-linked chains of finite length, and entanglements."""
 
-from collections.abc import Mapping
-from typing import Any
-
-from hmsa.model.laws.record import (
-    above,
-    Constant,
-    Elastic,
-    Law,
-    network,
-    NONAFFINE,
-    positive_modulus,
-)
+from hmsa.model.laws.formula import law_of, log1p, Strain, Term
+from hmsa.model.laws.record import Constant
 
 
-def _scaled(values: Mapping[str, Any]) -> tuple[float, Elastic]:
-    gc, ge, lambda_m = (float(values[x.name]) for x in LAW.constants)
-    beyond = above(LAW.name, 'law.lambda_m', lambda_m, 1.0)**2 - 1.0
-    modulus = positive_modulus(
-        LAW.name, gc * (1.0 + 2.0 / (3.0 * beyond)) + ge,
-        'gc (1 + 2/(3 (lambda_m^2 - 1))) + ge', (gc, ge, lambda_m))
-    return modulus, network(LAW, NONAFFINE, values, modulus, (lambda_m,), 3.0 * beyond)
+def _energy(strain: Strain, gc: Term, ge: Term, lambda_m: Term) -> Term:
+    n = lambda_m ** 2
+    return gc * (strain.first / 6.0 - n * log1p(-strain.first / (3.0 * (n - 1.0)))) + (
+        ge * strain.over_stretches(lambda x: (x - 1.0) ** 2 / x))
 
 
-LAW = Law(
+LAW = law_of(
     'nonaffine',
     'gc (I1/6 - lambda_m^2 ln(3 lambda_m^2 - I1)) + ge sum (l_i + 1/l_i)',
     'J. D. Davidson, N. C. Goulbourne, J. Mech. Phys. Solids 61, 1784 (2013), '
     'doi:10.1016/j.jmps.2013.03.009',
-    (Constant('law.gc', 'modulus of the cross-links', minimum=0.0, place=0),
-     Constant('law.ge', 'modulus of the entanglements', minimum=0.0, place=1),
+    (Constant('law.gc', 'modulus of the cross-links', minimum=0.0),
+     Constant('law.ge', 'modulus of the entanglements', minimum=0.0),
      Constant('law.lambda_m', 'stretch at which the chains lock', '', minimum=0.0, maximum=1e3,
-              place=2, inverse=True)), _scaled)
+              above=1.0, inverse=True)), _energy)

@@ -16,9 +16,8 @@ TABLE = 4.0  # number of pieces, then the result of `hmsa.model.laws.curve.Curve
 BEAM = 5.0  # result of `hmsa.model.laws.bending.packed`
 ARRUDA_BOYCE = 6.0  # mu, lambda_m
 ELASTICA = 7.0  # result of `hmsa.model.laws.elastica.packed`
-NONAFFINE = 8.0  # gc, ge, lambda_m
-EXTENDED_TUBE = 9.0  # gc, ge, delta, beta
-CONDENSED = 10.0  # result of `hmsa.model.compressible.condensed`
+FORMULA = 8.0  # result of `hmsa.model.laws.formula`
+CONDENSED = 9.0  # result of `hmsa.model.compressible.condensed`
 #: Families whose coordinate is the deflection of a tip.
 BEAMS = (BEAM, ELASTICA)
 
@@ -41,6 +40,7 @@ class Constant:
     kind: type = float  #: float, list or str
     minimum: float = -1e12  #: of the number, or of each in a list; closed range
     maximum: float = 1e12
+    above: float = -math.inf  #: bound of an open range
     fixed: bool = False  #: whether it is read once, when a node starts
     #: Index among the constants of the family; for a list, of its first value, with a stride of 2;
     #: -1 if it cannot be identified.
@@ -128,24 +128,6 @@ def polynomial(
     return Elastic(
         law.name, POLYNOMIAL, tuple(x / modulus for x in (second, *filled)),
         given(law, values, modulus))
-
-
-def network(
-        law: Law, family: float, values: Mapping[str, Any], modulus: float,
-        others: Sequence[float], chain_limit: float) -> Elastic:
-    """
-    Return a model of cross-links and entanglements, in units of the shear modulus.
-
-    ``others`` are its constants besides the moduli ``law.gc`` and ``law.ge`` (Pa), and
-    ``chain_limit`` is the greatest I1 - 3.
-    """
-    from hmsa.model.laws.chains import gent_limits  # NumPy, which not all users of laws need
-
-    lower, upper = gent_limits(1.0 / chain_limit)
-    return Elastic(
-        law.name, family, (*(values[x] / modulus for x in ('law.gc', 'law.ge')), *others),
-        given(law, values, modulus),
-        (max(float(lower), ENDLESS[0]), min(float(upper), ENDLESS[1])))
 
 
 def given(

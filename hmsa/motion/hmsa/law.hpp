@@ -118,67 +118,69 @@ template <class R> struct Ogden {
     }
 };
 
-template <class R> struct Network : Ogden<R> {
-    // f(I1) of cross-links, f' = p0 + p1/(1 - i x) + p2/(1 - i x)^2 with x = I1 - 3, and terms of
-    // Ogden of entanglements.
-    // Nonaffine: gc I1/6 - gc n ln(3 n - I1) + ge sum (l_i + 1/l_i), n = lambda_m^2,
-    // J. D. Davidson and N. C. Goulbourne, J. Mech. Phys. Solids 61, 1784 (2013).
-    // Extended tube: gc/2 ((1 - d) x/(1 - d x) + ln(1 - d x)) + 2 ge/b^2 sum (l_i^-b - 1),
-    // d = delta^2, M. Kaliske and G. Heinrich, Rubber Chem. Technol. 72, 602 (1999).
-    bool tube;
-    R gc, ge, bound, b;  // bound is lambda_m, or delta
-    R p[3], i_x;
-    void read(bool is_tube, const double *from)
+template <class R> struct Formula {
+    // An energy that is written in Python, as programs for itself and its force: steps of an
+    // operation and two registers (hmsa/model/laws/formula.py).
+    enum Operation { sum = 1, product, inverted, defined, logarithm, of_1_more, exponential, less_1, powered };
+    static constexpr int most = 96;
+    int known, fixed;  // numbers, and registers of these alone
+    const double *force_steps, *energy_steps, *end;
+    R constant[most];
+    void read(const double *from)
     {
-        tube = is_tube;
-        set(gc, 0, from[0]);
-        set(ge, 0, from[1]);
-        set(bound, 0, from[2]);
-        set(b, 0, tube ? from[3] : 1);
-        expand();
+        known = int(from[0]), fixed = known + int(from[1]);
+        for (int i = 0; i < known; i++)
+            set(constant[i], 0, from[4 + i]);
+        const double *steps = from + 4 + known;
+        force_steps = steps + 3 * int(from[1]);
+        energy_steps = force_steps + 3 * int(from[2]);
+        end = energy_steps + 3 * int(from[3]);
+        run(steps, force_steps, constant, known);
     }
-    void seed(int constant, int j)
+    void seed(int number, int j)
     {
-        R *const constants[] = {&gc, &ge, &bound, &b};
-        incline(*constants[constant], j, 1);
-        expand();
+        incline(constant[number], j, 1);
+        run(force_steps - 3 * (fixed - known), force_steps, constant, known);
     }
-    void expand()
+    // Puts the results of steps into registers from a place on; returns the last.
+    template <class S> static S run(const double *step, const double *end, S *x, int place)
     {
-        const R squared = bound * bound;
-        this->count = 2;
-        this->terms[1] = -b;
-        this->terms[3] = b;
-        if (tube) {
-            i_x = squared;
-            p[0] = 0.0 * gc;
-            p[1] = -0.5 * gc * squared;
-            p[2] = 0.5 * gc * (1.0 - squared);
-            this->terms[0] = -2.0 * ge * inverse(b);
-            this->terms[2] = 0.0 * ge;
-        } else {
-            i_x = inverse(3.0 * (squared - 1.0));
-            p[0] = gc * (1. / 6);
-            p[1] = gc * squared * i_x;
-            p[2] = 0.0 * gc;
-            this->terms[0] = -1.0 * ge;
-            this->terms[2] = ge;
+        for (; step < end; step += 3, place++) {
+            const S &a = x[int(step[1])], &b = x[int(step[2])];
+            const real<S> &at = value(a);
+            switch (int(step[0])) {
+            case sum: x[place] = a + b; break;
+            case product: x[place] = a * b; break;
+            case inverted: x[place] = inverse(a); break;
+            case defined: x[place] = positive(a); break;
+            case logarithm: x[place] = through(a, real<S>(log(at)), real<S>(1.0 / at)); break;
+            case of_1_more: x[place] = through(a, real<S>(log1p(at)), real<S>(1.0 / (1.0 + at))); break;
+            case exponential: x[place] = through(a, real<S>(exp(at)), real<S>(exp(at))); break;
+            case less_1: x[place] = through(a, real<S>(expm1(at)), real<S>(exp(at))); break;
+            default: x[place] = power(a, b);
+            }
         }
+        return x[place - 1];
     }
-    template <class S> HMSA_INLINE S force(const S &l) const
+    template <class S> S ran(const double *first, const double *last, const S &l) const
     {
-        const S i_l = inverse(positive(l)), e = l - 1.0;
-        const S half = e * (l * l + l + 1.0) * i_l * i_l, x = e * e * (l + 2.0) * i_l;
-        const S near = inverse(positive(1.0 - x * i_x));
-        return 2.0 * half * ((near * p[2] + p[1]) * near + p[0]) + Ogden<R>::force(l);
+        S x[most];
+        for (int i = 0; i < fixed; i++) {
+            if constexpr (std::is_same_v<S, R>)
+                x[i] = constant[i];
+            else
+                x[i] = 0.0 * l + get(constant[i], 0);
+        }
+        // Without cancellation near l = 1.
+        const S e = l - 1.0, i_l = inverse(positive(l)), cubic = 2.0 * e * (l * l + l + 1.0) * i_l * i_l;
+        const real<S> across = sqrt(value(i_l));
+        x[fixed] = l, x[fixed + 1] = through(l, across, real<S>(-0.5 * across * value(i_l)));
+        x[fixed + 2] = e * e * (l + 2.0) * i_l, x[fixed + 3] = e * e * (2.0 * l + 1.0) * i_l * i_l;
+        x[fixed + 4] = cubic, x[fixed + 5] = cubic * i_l;
+        return run(first, last, x, fixed + 6);
     }
-    double energy(double l) const
-    {
-        const double x = (l - 1) * (l - 1) * (l + 2) / positive(l), i = get(i_x, 0);
-        const double chains = i > 0 ? -log1p(-i * x) / i : x, left = positive(1 - i * x);
-        return get(p[0], 0) * x + get(p[1], 0) * chains + get(p[2], 0) * x / left
-            + Ogden<R>::energy(l);
-    }
+    template <class S> S force(const S &l) const { return ran(force_steps, energy_steps, l); }
+    double energy(double l) const { return ran(energy_steps, end, l); }
 };
 
 // sum c_k u^k, and its derivative by u.

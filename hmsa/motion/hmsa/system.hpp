@@ -10,8 +10,7 @@ namespace hmsa {
 // Indices in a packed material, and families of models (hmsa/model/law.py, laws/record.py).
 enum Place { kind_at, zeta_at, c1_at, damping_at, lower_at, upper_at, constants_at };
 enum Family {
-    gent, neo_hookean, polynomial, ogden, table, beam, arruda_boyce, elastica, nonaffine,
-    extended_tube, condensed
+    gent, neo_hookean, polynomial, ogden, table, beam, arruda_boyce, elastica, formula, condensed
 };
 
 // Functions of the stretch alone are differentiated by it, and then by the chain rule, unless the
@@ -209,7 +208,7 @@ template <class C> struct AnyOf {
     double rest, c1, drag;
     ArrudaBoyce<C> polynomial_law;
     Ogden<C> ogden_law;
-    Network<C> network_law;
+    Formula<C> formula_law;
     Table<double> table_law;
     Beam beam_law;
     Condensed condensed_law;
@@ -222,8 +221,7 @@ template <class C> struct AnyOf {
         case polynomial: return polynomial_law.Polynomial<C>::read(0, m + constants_at);
         case arruda_boyce: return polynomial_law.read(0, m + constants_at);
         case ogden: return ogden_law.read(0, m + constants_at);
-        case nonaffine:
-        case extended_tube: return network_law.read(kind == extended_tube, m + constants_at);
+        case formula: return formula_law.read(m + constants_at);
         case table: return table_law.read(0, m + constants_at);
         case condensed: condensed_law = {m + constants_at}; return;
         default:
@@ -236,8 +234,7 @@ template <class C> struct AnyOf {
         case polynomial: return polynomial_law.Polynomial<C>::seed(constant, j);
         case arruda_boyce: return polynomial_law.seed(constant, j);
         case ogden: return ogden_law.seed(constant, j);
-        case nonaffine:
-        case extended_tube: return network_law.seed(constant, j);
+        case formula: return formula_law.seed(constant, j);
         }
     }
     template <class F> auto with_law(const F &f) const
@@ -246,8 +243,7 @@ template <class C> struct AnyOf {
         case polynomial:
         case arruda_boyce: return f(polynomial_law);
         case ogden: return f(ogden_law);
-        case nonaffine:
-        case extended_tube: return f(network_law);
+        case formula: return f(formula_law);
         case table: return f(table_law);
         case condensed: return f(condensed_law);
         default: return f(beam_law);
