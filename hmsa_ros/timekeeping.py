@@ -1,4 +1,4 @@
-"""A steady clock; with it, steps of the wall clock, and time that passes at another speed."""
+"""A steady clock, with it steps of the wall clock, time at another speed, and a limit of rates."""
 
 from collections.abc import Callable
 from functools import partial
@@ -92,3 +92,23 @@ class RealTimeFactor:
         """Continue from a simulated time in ns at another speed; 0 for as fast as possible."""
         self.factor = factor
         self.set_paused(self.paused, time)
+
+
+class Throttle:
+    """
+    Permit a report at most once a second.
+
+    The throttle of a logger first determines its calling location in the code, which takes up to a
+    millisecond. This is too slow for events that may occur a thousand times a second.
+    """
+
+    def __init__(self) -> None:
+        self._next = 0.0
+
+    def __call__(self) -> bool:
+        """Return whether a report is due."""
+        now = time.monotonic()
+        if now < self._next:
+            return False
+        self._next = now + 1.0
+        return True

@@ -11,7 +11,7 @@ from std_msgs.msg import Float64
 from hmsa.interfaces import topics
 from hmsa.interfaces.status import texts
 from hmsa_ros.nodes import conversions
-from hmsa_ros.runtime.cycles import Cycles
+from hmsa_ros.nodes.controller import Cycles
 
 MS = 1_000_000
 # In slow motion, so that a busy machine is no matter; commands come just in time.

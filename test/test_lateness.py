@@ -12,6 +12,7 @@ from hmsa.model.parameters import paper_actuator
 from hmsa.model.simulation import ActuatorSimulation
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Options, Planner
+from hmsa.planning.weighing import better_than_keeping
 from hmsa_ros.runtime.records import (
     Environment,
     Note,
@@ -22,7 +23,6 @@ from hmsa_ros.runtime.records import (
     Trajectory,
 )
 from hmsa_ros.runtime.runtime import Runtime
-from hmsa_ros.runtime.weighing import better_than_keeping
 
 MS = 1_000_000
 START = 1000 * MS
@@ -186,8 +186,8 @@ def _policies(kind, seed, monkeypatch, case=None):
                 patch.setattr('hmsa_ros.runtime.deviations.expected', lambda *_: np.ones(1))
                 patch.setattr(
                     'hmsa_ros.runtime.deviations.better_than_keeping', lambda *_, **__: True)
-                patch.setattr('hmsa_ros.runtime.lateness.Lateness.expected', 0)
-                patch.setattr('hmsa_ros.runtime.lateness.Lateness.unsure', False)
+                patch.setattr('hmsa.planning.lateness.Lateness.expected', 0)
+                patch.setattr('hmsa.planning.lateness.Lateness.unsure', False)
             left[policy] = sequence(
                 unit, lead * MS, _delays(kind, largest, seed), shaper=shaper,
                 settings=replace(QUIET, replan_late=policy != 'nothing')).mean()

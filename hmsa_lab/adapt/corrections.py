@@ -12,6 +12,7 @@ from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.planner import Planner
 from hmsa.planning.timeline import Draft, JointModel, PlannedLevel, Timeline
+from hmsa.planning.weighing import LEAST_STEP, step_of
 from hmsa_lab.adapt.adaptive_joint import AdaptiveJoint
 from hmsa_lab.adapt.estimator import StateEstimate
 from hmsa_lab.adapt.expected_error import (
@@ -34,7 +35,6 @@ from hmsa_lab.adapt.motion import rest
 from hmsa_lab.adapt.move_errors import Moves
 from hmsa_ros.runtime.planning_task import PlanningTask, Replanning, replanning
 from hmsa_ros.runtime.records import Clock, Severity, Verdict
-from hmsa_ros.runtime.weighing import LEAST_STEP, step_of
 
 if TYPE_CHECKING:
     from hmsa_lab.adapt.feedback import Feedback

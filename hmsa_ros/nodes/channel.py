@@ -13,7 +13,7 @@ from hmsa.model.units import NANOSECONDS
 from hmsa_ros.nodes import conversions, ros_entities
 from hmsa_ros.runtime.records import Send, StretchRequest
 from hmsa_ros.runtime.runtime import Runtime
-from hmsa_ros.runtime.throttle import Throttle
+from hmsa_ros.timekeeping import Throttle
 
 # Time in ns after which all topics of a device that runs are discovered.
 _DISCOVERY = 2 * NANOSECONDS

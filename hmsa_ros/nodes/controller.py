@@ -10,7 +10,10 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 import gc
+from time import monotonic_ns, thread_time_ns
 
+import numpy as np
+from numpy.typing import NDArray
 from rclpy.node import Node
 
 from hmsa.interfaces import topics
@@ -23,12 +26,13 @@ from hmsa_ros.nodes.driver import DriverNode, HARDWARE, SHORT
 from hmsa_ros.nodes.planner import PlannerNode
 from hmsa_ros.nodes.plant import PlantNode
 from hmsa_ros.nodes.runner import run
-from hmsa_ros.runtime.cycles import Cycles
-from hmsa_ros.runtime.records import by_joint, ObservedSample, Output, Send
+from hmsa_ros.runtime.records import Clock, ObservedSample, Output, Send, Severity
 from hmsa_ros.timekeeping import steady_ns
 
 # Time in ns that must remain of a period to publish one more message; limit on waiting messages.
 _ENOUGH, _CROWDED = 400_000, 50
+# Number of cycles whose processor times are stored.
+_REMEMBERED = 4096
 
 
 class LinkedPlanner(PlannerNode):
@@ -77,11 +81,7 @@ class LinkedPlanner(PlannerNode):
     def take_sample(self, joints: Sequence[str], sample: Sample) -> None:
         """Process a sample of all joints."""
         self._seen = joints, sample
-        if self._runtime.looks_at(sample.time):
-            for name, samples in by_joint(joints, [(
-                    sample.time, sample.stretch.tolist(), sample.rate.tolist(),
-                    sample.flux_density.tolist(), self.now())]):
-                self._runtime.observed(name, samples)
+        self._runtime.sampled(joints, [sample])
 
     def take_refusal(self, joint: str, refuses: str, cut_off_time: int) -> None:
         """Record why commands of a joint are rejected, as in a receipt."""
@@ -131,6 +131,65 @@ class LinkedPlanner(PlannerNode):
             # Simulated time may advance far until the cycle ends.
             super()._take(self._waiting)
             self._waiting.clear()
+
+
+class Cycles:
+    """
+    Measure the cycles of a loop, each run in this context manager; all times are in ns.
+
+    ``late`` counts the cycles that began more than a period after they were due.
+    """
+
+    def __init__(
+            self, period: int, *, steady: Clock = monotonic_ns,
+            cpu: Clock = thread_time_ns) -> None:
+        self.count = self.late = self.largest = 0
+        self._period, self._steady, self._cpu = period, steady, cpu
+        self._work = np.zeros(_REMEMBERED, dtype=np.int64)
+        self._rest = np.zeros(_REMEMBERED, dtype=np.int64)
+        self._due = self._begun = self._ended = 0
+        self._reported = 0, 0
+
+    def __enter__(self) -> None:
+        now = self._steady()
+        lateness = now - self._due if self.count else 0
+        if lateness > self._period:
+            self.late += 1
+            self.largest = max(self.largest, lateness)
+        # The grid is that of the first cycles; missed cycles are skipped.
+        self._due = now + self._period - (
+            lateness if 0 < lateness <= self._period else 0)
+        self._begun = self._cpu()
+
+    def __exit__(self, *_: object) -> None:
+        self._ended = self._cpu()
+        self._work[self.count % _REMEMBERED] = self._ended - self._begun
+        self.count += 1
+
+    @property
+    def left(self) -> int:
+        """Time until the next cycle is due; negative if it is late."""
+        return self._due - self._steady()
+
+    def note_rest(self) -> None:
+        """Record the processor time spent since the last cycle ended."""
+        self._rest[(self.count - 1) % _REMEMBERED] = self._cpu() - self._ended
+
+    def _figures(self, name: str, spent: NDArray[np.int64]) -> dict[str, object]:
+        """Return median, 99 % quantile and maximum of recent processor times in us."""
+        seen = spent[:max(self.count, 1)]
+        return {f'{name}_{key}_us': f'{float(np.quantile(seen, x)) / 1e3:.1f}'
+                for key, x in (('p50', 0.5), ('p99', 0.99), ('largest', 1.0))}
+
+    def report(self) -> tuple[Severity, str, dict[str, object]]:
+        """Return severity and message for the cycles since the last call, and counters."""
+        count, late = self.count - self._reported[0], self.late - self._reported[1]
+        self._reported = self.count, self.late
+        message = f'{late} of {count} cycles late' if late else 'cycles in time'
+        return Severity.WARN if late else Severity.OK, message, {
+            'cycles': self.count, 'late': self.late,
+            'largest_lateness_ms': f'{self.largest / 1e6:.3f}',
+            **self._figures('work', self._work), **self._figures('rest', self._rest)}
 
 
 class Linked(DeviceNode):

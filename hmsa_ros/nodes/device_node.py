@@ -25,8 +25,7 @@ from hmsa_ros.nodes.capture import decode, FastPublisher, RawSubscription
 from hmsa_ros.nodes.duplicate_nodes import DuplicateNodes
 from hmsa_ros.nodes.managed import ManagedNode, silence
 from hmsa_ros.nodes.parameters import JointParameters, JOINTS
-from hmsa_ros.runtime.throttle import Throttle
-from hmsa_ros.timekeeping import steady_ns
+from hmsa_ros.timekeeping import steady_ns, Throttle
 
 #: Behaviour of a joint without commands; each joint may have its own values.
 FALLBACK = (

@@ -24,7 +24,7 @@ from hmsa.offload import Offload
 from hmsa.plugins import FOLLOWER, registered
 from hmsa_ros.nodes import conversions, ros_entities
 from hmsa_ros.nodes.capture import decode, RawSubscription, Taken
-from hmsa_ros.nodes.cdr import JointStateReader, read_trajectory, stamp_of
+from hmsa_ros.nodes.cdr import JointStateReader, read_trajectory
 from hmsa_ros.nodes.channel import JointChannel
 from hmsa_ros.nodes.duplicate_nodes import DuplicateNodes
 from hmsa_ros.nodes.managed import ManagedNode
@@ -209,8 +209,7 @@ class PlannerNode(ManagedNode):
         before, self._read = self._read, monotonic_ns()
         taken = self._samples.take(_AT_ONCE)
         # Samples of two plants do not belong to one actuator.
-        if taken and not self._runtime.crowded and self._runtime.looks_at(
-                max(stamp_of(x.data) for x in taken)):
+        if taken and not self._runtime.crowded:
             self._take_samples(taken, before)
         return len(taken) == _AT_ONCE
 
@@ -229,6 +228,8 @@ class PlannerNode(ManagedNode):
                 self.get_logger().error(f'sample ignored: {error}', throttle_duration_sec=1.0)
                 continue
             rows.setdefault(names, []).append((stamp, *measured, now - min(age, most)))
+        if not rows or not self._runtime.looks_at(max(x[0] for y in rows.values() for x in y)):
+            return
         for names, of_joints in rows.items():
             for name, samples in records.by_joint(names, of_joints):
                 self._runtime.observed(name, samples)

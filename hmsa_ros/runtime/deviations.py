@@ -11,14 +11,10 @@ from hmsa.errors import HmsaError
 from hmsa.model.status import Code
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.group import PlannerGroup, resumed, Resumption
+from hmsa.planning.lateness import Lateness
 from hmsa.planning.planner import Planner
 from hmsa.planning.timeline import Draft, Options
-from hmsa_ros.runtime.lateness import Lateness
-from hmsa_ros.runtime.planning_task import PlanningTask, Replanning, replanning
-from hmsa_ros.runtime.receipts import Receipts
-from hmsa_ros.runtime.records import Settings, Severity, Verdict
-from hmsa_ros.runtime.throttle import Throttle
-from hmsa_ros.runtime.weighing import (
+from hmsa.planning.weighing import (
     aims,
     better_than_keeping,
     compared,
@@ -26,6 +22,10 @@ from hmsa_ros.runtime.weighing import (
     SHARE,
     step_of,
 )
+from hmsa_ros.runtime.planning_task import PlanningTask, Replanning, replanning
+from hmsa_ros.runtime.receipts import Receipts
+from hmsa_ros.runtime.records import Settings, Severity, Verdict
+from hmsa_ros.timekeeping import Throttle
 
 # Fraction of a period by which commands may be late and are still sent.
 _PART = 0.25

@@ -8,10 +8,10 @@ the time, the applied levels, the cut-offs and the samples.
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
-from hmsa.model.equations import Array
+from hmsa.model.sensor import Sample
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.group import PlannerGroup
-from hmsa_ros.runtime.records import by_joint, Environment, Output, Send, Settings
+from hmsa_ros.runtime.records import Environment, Output, Send, Settings
 from hmsa_ros.runtime.runtime import Runtime
 
 # Time to wait, in ns, while the controller waits for something.
@@ -38,8 +38,8 @@ class LoopDevice(Protocol):
     def changes(self) -> Sequence[tuple[int, int, float]]:
         """Return the levels that took effect: joint, timestamp and level."""
 
-    def samples(self) -> Sequence[tuple[int, Array, Array, Array]]:
-        """Return the samples: timestamp, and stretch, rate (1/s) and field of each joint."""
+    def samples(self) -> Sequence[Sample]:
+        """Return the samples since the last call."""
 
 
 class LoopGuard(Protocol):
@@ -114,9 +114,4 @@ class Loop:
         for guard in self._guards:
             self.runtime.cut_off(
                 self._names[guard.number], in_force=guard.is_cut_off, time=guard.cut_off_time)
-        samples = self.device.samples()
-        if samples and self.runtime.looks_at(samples[-1][0]):
-            rows = [(stamp, *(x.tolist() for x in measured), self.now)
-                    for stamp, *measured in samples]
-            for name, of_joint in by_joint(self._names, rows):
-                self.runtime.observed(name, of_joint)
+        self.runtime.sampled(self._names, self.device.samples())

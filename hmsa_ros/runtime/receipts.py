@@ -5,8 +5,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from hmsa.model.units import NANOSECONDS
+from hmsa.planning.lateness import Disturbance
 from hmsa_ros.runtime.device_clock import DeviceClock, Offset
-from hmsa_ros.runtime.lateness import Disturbance
 
 # Receipts arrive five times a second: longest gap between them, in ns by the steady clock.
 _PATIENCE = 800_000_000

@@ -6,11 +6,12 @@ latest at `Runtime.wake`, and delivers the returned outputs: a node to topics, a
 directly to the coil.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 import math
 import re
 
+from hmsa.model.sensor import Sample
 from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning import path
@@ -22,6 +23,7 @@ from hmsa_ros.runtime.deviations import Deviations
 from hmsa_ros.runtime.follower import feedback, Follower
 from hmsa_ros.runtime.receipts import Receipts
 from hmsa_ros.runtime.records import (
+    by_joint,
     check_request,
     Environment,
     Note,
@@ -38,12 +40,10 @@ from hmsa_ros.runtime.records import (
 )
 from hmsa_ros.runtime.reporting import LOOK, Reporting
 from hmsa_ros.runtime.request_queue import RequestQueue, SLICE
-from hmsa_ros.runtime.sample_timeout import SampleTimeout
 from hmsa_ros.runtime.stops import Stops
-from hmsa_ros.runtime.takeover import Takeover
+from hmsa_ros.runtime.takeover import SampleTimeout, Takeover
 from hmsa_ros.runtime.temperatures import Temperatures
-from hmsa_ros.runtime.throttle import Throttle
-from hmsa_ros.timekeeping import clock_set_words
+from hmsa_ros.timekeeping import clock_set_words, Throttle
 
 # In ns by the steady clock: delay of a service that is a stall of this process; time that the
 # middleware then takes to deliver what has arrived; and time within which a device that is within
@@ -279,6 +279,14 @@ class Runtime:
             self.deviations.applied(joint, stamp, flux_density, self.settings, now)
         else:
             self.deviations.newest[joint] = stamp, flux_density
+
+    def sampled(self, joints: Sequence[str], samples: Sequence[Sample]) -> None:
+        """Process samples of all joints that have just been measured, as far as needed."""
+        if samples and self.looks_at(samples[-1].time):
+            now = self._clock() + self._stepped
+            rows = [(time, *(x.tolist() for x in measured), now) for time, *measured in samples]
+            for name, of_joint in by_joint(joints, rows):
+                self.observed(name, of_joint)
 
     def observed(self, joint: str, samples: Samples) -> None:
         """Process samples of a joint."""

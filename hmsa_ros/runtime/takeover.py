@@ -2,15 +2,16 @@
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 import math
 
 from hmsa.errors import BadInputError, HmsaError
+from hmsa.judge.stillness import Stillness
 from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.planner import Planner
 from hmsa_ros.runtime.receipts import Receipts
 from hmsa_ros.runtime.records import Environment, ObservedSample, Settings
-from hmsa_ros.runtime.stillness import Stillness
 
 # Largest age of a sample that shows where a joint is, in ns by the steady clock; and of one that
 # does although its level has changed since, as it does all the time along a path.
@@ -27,6 +28,8 @@ _ANOTHER_CLOCK = 100_000_000 * NANOSECONDS
 _LEAST, _WAY, _MOVING, _ARRIVED = 0.03, 0.5, 0.6, 0.25
 # Time scales after an arrival until which a joint counts as moving.
 _QUIET = 20.0
+# Longest gap between samples: in ns by the steady clock, and in sampling intervals.
+_SILENCE, _INTERVALS = 2 * NANOSECONDS, 3
 
 
 class Takeover:
@@ -155,7 +158,9 @@ class Takeover:
             return seen
         level = self._newest.get(name)
         since = max(self._planners[name].changed(seen.stamp), 0 if level is None else level[0])
-        rest = self._still[name].rest(self._planners[name].model, since)
+        model = self._planners[name].model
+        rest = self._still[name].rest(
+            lambda x: model.frequency(x) / model.units.time, since)
         return None if rest is None else seen._replace(stretch=rest, rate=0.0)
 
     def _take(self, name: str, seen: ObservedSample, *, keep: bool = False) -> bool:
@@ -331,3 +336,51 @@ def _tolerance(planner: Planner, time: int, predicted: float) -> float:
         time > segment.arrival + planner.model.ns(_QUIET))
     share = _ARRIVED if arrived else _MOVING
     return max(_LEAST, _WAY * abs(predicted - rest), share * plan.step(place))
+
+
+@dataclass
+class _LastSample:
+    """The newest sample of a joint; times in ns."""
+
+    stamp: int
+    came: int  # time of arrival by the steady clock
+    time: int  # time of arrival by the clock of the timestamps, which may be paused
+    interval: int  # from the previous sample
+    silent: bool = False
+
+
+class SampleTimeout:
+    """
+    Detect that samples stop while their publisher still exists.
+
+    A publisher that ends normally disappears at once.
+    """
+
+    def __init__(self, environment: Environment) -> None:
+        self._around = environment
+        self._joints: dict[str, _LastSample] = {}
+
+    def restart(self) -> None:
+        """Discard all samples."""
+        self._joints.clear()
+
+    def record(self, joint: str, stamp: int) -> None:
+        """Record the timestamp of the newest sample of a joint."""
+        before = self._joints.get(joint)
+        self._joints[joint] = _LastSample(
+            stamp, self._around.steady(), self._around.clock(),
+            0 if before is None else stamp - before.stamp)
+
+    @property
+    def words(self) -> str:
+        """The joint whose samples have stopped, in a sentence; empty for none."""
+        steady, now = self._around.steady(), self._around.clock()
+        for name, joint in self._joints.items():
+            if not joint.silent and steady - joint.came > _SILENCE and (
+                    now - joint.time > _INTERVALS * joint.interval):
+                joint.silent = self._around.observable()
+            if joint.silent:
+                return (
+                    f'no sample of joint {name} for more than {_SILENCE / NANOSECONDS:g} s, '
+                    'though samples came before: its sensor has failed, or cannot be reached')
+        return ''

@@ -11,7 +11,7 @@ from hmsa.planning.planner import Planner
 from hmsa.planning.timeline import Draft
 from hmsa_ros.runtime.planning_task import Drafts, PlanningTask, Replanning, replanning
 from hmsa_ros.runtime.records import Clock, Settings
-from hmsa_ros.runtime.throttle import Throttle
+from hmsa_ros.timekeeping import Throttle
 
 # Deviation of a level from that which holds the stretch at the measured temperature, as a
 # fraction, from which a plan is made again; and shortest time in ns between two of these.

@@ -17,8 +17,8 @@ from hmsa.errors import HmsaError
 from hmsa.model.moves import Level
 from hmsa.model.simulation import sampled
 from hmsa.model.units import NANOSECONDS
+from hmsa.planning.lateness import Lateness
 from hmsa.planning.timeline import Draft, PlannedLevel, Timeline
-from hmsa_ros.runtime.lateness import Lateness
 
 #: Smaller steps are replaced by this one.
 LEAST_STEP = 0.1

@@ -1,12 +1,12 @@
 """Whether a joint rests, by samples that contain no rate."""
 
 from collections import deque
+from collections.abc import Callable
 
 import numpy as np
 
 from hmsa.judge.fit import FEWEST, fit
 from hmsa.model.units import NANOSECONDS
-from hmsa.planning.timeline import JointModel
 
 # Number of stored samples, and fraction of them that is new at each evaluation.
 _STORED, _NEW = 300, 0.25
@@ -40,23 +40,27 @@ class Stillness:
         self._new = 0  # number of samples since the last evaluation
         self._rest: float | None = None
 
-    def rest(self, model: JointModel, since: int) -> float | None:
-        """Return the stretch at which a joint rests by samples after a time in ns, else None."""
+    def rest(self, frequency: Callable[[float], float], since: int) -> float | None:
+        """
+        Return the stretch at which a joint rests by samples after a time in ns, else None.
+
+        ``frequency`` returns the natural frequency in rad/s about a stretch.
+        """
         if self._samples and self._samples[-1][0] <= since:
             self.clear()
         while self._samples and self._samples[0][0] <= since:
             self._samples.popleft()
         if len(self._samples) >= FEWEST and self._new >= _NEW * len(self._samples):
             self._new = 0
-            self._rest = self._evaluated(model)
+            self._rest = self._evaluated(frequency)
         return self._rest
 
-    def _evaluated(self, model: JointModel) -> float | None:
+    def _evaluated(self, frequency: Callable[[float], float]) -> float | None:
         time, stretch = np.array(self._samples, dtype=np.float64).T
         middle = float(np.mean(stretch))
         found = fit(
             (time - time[0]) / NANOSECONDS, stretch - middle,
-            model.frequency(middle) / model.units.time, 0.0, lambda _: True)
+            frequency(middle), 0.0, lambda _: True)
         if found is None or not found.vibration.high <= _REST:
             return None
         return middle + found.offset.value
