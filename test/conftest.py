@@ -26,6 +26,7 @@ from forks import Forked, ForkServer
 from hypothesis import HealthCheck, Phase, settings
 import pytest
 
+from hmsa.cli import terminal
 from hmsa_ros.middleware import fast_dds, PROFILES, profiles
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -63,6 +64,8 @@ class SkipWithoutRos:
 
 def pytest_configure(config: pytest.Config) -> None:
     """Ignore warnings that cannot be fixed here, and start processes alike."""
+    # What a command prints must not depend on how busy the machine is.
+    terminal.PATIENCE = 1e6
     if not has('rclpy'):
         SkipWithoutRos.install()
     for number in (signal.SIGINT, signal.SIGHUP):
@@ -182,6 +185,11 @@ def wait_until(
             pytest.fail(f'waited {seconds:g} s for {what}')
         time.sleep(POLL_SECONDS)
     return result
+
+
+def without_progress(told: str) -> str:
+    """Return what a command told, except that it was at work, as it says on a busy machine."""
+    return re.sub(r'^.* \.\.\.\n', '', told, flags=re.M)
 
 
 @pytest.fixture(autouse=True)

@@ -1,5 +1,6 @@
 """The client of a planner: whom it waits for, verdicts of its own, the stop."""
 
+import re
 import signal
 import subprocess
 import sys
@@ -7,6 +8,7 @@ import sys
 import pytest
 from trajectory_msgs.msg import JointTrajectory
 
+from hmsa.cli import main, terminal
 from hmsa_ros.clients.client import PlannerClient
 from hmsa_ros.clients.link import Link
 from hmsa_ros.nodes.planner import PlannerNode
@@ -50,15 +52,17 @@ def test_each_of_many_requests_at_once_has_a_verdict_of_its_own(ros_env, serve):
             client.__exit__()
 
 
-@pytest.mark.ros
-def test_a_command_without_a_planner_soon_says_what_it_waits_for(start):
-    for words in (['stop'], ['param', 'set', 'planner', 'shaper', 'robust']):
-        command = start.hmsa(*words, '--timeout', '2')
-        assert command.wait() == 1
-        note, error = command.stderr.splitlines()
-        assert note.startswith('hmsa: note: waiting')
-        assert 'planner' in note
-        assert error.startswith('hmsa: error: waited 2 s: no ')
+@pytest.mark.parametrize('words', [
+    ['stop'], ['param', 'set', 'planner', 'shaper', 'robust'], ['send', '1.1:1'],
+    ['watch', '--once']])
+def test_a_command_without_a_planner_says_again_and_again_what_it_waits_for(
+        words, ros_env, handlers, capfd, monkeypatch):
+    monkeypatch.setattr(terminal, 'PATIENCE', 0.02)
+    assert main([*words, '--timeout', '1']) == 1
+    told = [x for x in capfd.readouterr().err.splitlines() if x.startswith('waiting up to 1 s')]
+    assert re.search('planner|samples', told[0])
+    assert len(told) > 1
+    assert all(x.startswith(f'{told[0][:-4]}, ') for x in told[1:])
 
 
 @pytest.mark.ros

@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 
+from conftest import without_progress
 from extras import needs
 import pytest
 
@@ -35,9 +36,11 @@ sys.meta_path.insert(0, Blocker())
 
 def run(code: str) -> 'subprocess.CompletedProcess[str]':
     """Run code in a fresh Python at the root of the repository."""
-    return subprocess.run(
+    done = subprocess.run(
         [sys.executable, '-W', 'error', '-c', code], cwd=ROOT, capture_output=True, text=True,
         check=False)
+    done.stderr = without_progress(done.stderr)
+    return done
 
 
 def modules(package: str) -> list[str]:

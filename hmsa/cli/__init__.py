@@ -9,6 +9,7 @@ imported within these functions, so that ``hmsa --help`` answers immediately.
 
 import argparse
 from collections.abc import Sequence
+from contextlib import nullcontext
 from difflib import get_close_matches
 import os
 import re
@@ -16,7 +17,7 @@ import sys
 from typing import Any, NoReturn
 
 from hmsa import __version__
-from hmsa.cli.terminal import collecting, show_notes, tolerate, unshown
+from hmsa.cli.terminal import collecting, show_notes, tolerate, under_way, unshown
 from hmsa.ending import ENDING
 from hmsa.errors import complain, HmsaError
 from hmsa.plugins import COMMANDS, registered
@@ -111,7 +112,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments.ros_args = for_ros
     ENDING.interrupt()
     try:
-        with collecting(at_once=arguments.is_node):
+        # A node has its log.
+        with collecting(at_once=arguments.is_node), (
+                nullcontext() if arguments.is_node else under_way(arguments.parser.prog)):
             status: int = arguments.run(arguments)
         show_notes()
         print(end='', flush=True)  # also where standard output is closed

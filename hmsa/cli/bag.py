@@ -15,7 +15,7 @@ from typing import Any
 
 from hmsa.bag.limits import CHUNK_SIZE, MEBIBYTE
 from hmsa.cli.options import add_command, JSON, show
-from hmsa.cli.terminal import progress
+from hmsa.cli.terminal import progress, under_way
 from hmsa.errors import BadInputError, printable
 
 _LARGEST_CHUNK = 65536
@@ -72,8 +72,9 @@ def _info(arguments: argparse.Namespace) -> int:
     with progress('reading'):
         reader = BagReader(arguments.bag, max_chunk_size=_chunk_size(arguments))
         summary, notes = summarize(reader), tuple(unanswered(reader))
-    print(to_json(summary, notes) if arguments.json else to_text(
-        summary, notes, parameters=arguments.parameters))
+    with under_way():  # a pager takes the lines when it likes
+        print(to_json(summary, notes) if arguments.json else to_text(
+            summary, notes, parameters=arguments.parameters))
     # A bag that is still written, or whose recorder was killed, is readable as far as it goes.
     return 1 if summary.unreadable or summary.closed and not summary.complete else 0
 

@@ -189,13 +189,14 @@ def show(
         arguments: argparse.Namespace, record: dict[str, Any], *lines: object,
         written: Iterable[Path | None] = ()) -> int:
     """Print a result as JSON with --json, otherwise as lines with the files written; return 0."""
-    from hmsa.cli.terminal import show_notes, with_notes
+    from hmsa.cli.terminal import show_notes, under_way, with_notes
     from hmsa.files import json_text
 
     show_notes()
-    for line in [json_text(with_notes(record))] if arguments.json else [
-            *lines, *(f'{x} written' for x in written if x is not None)]:
-        print(line)
+    with under_way():  # a pager takes the lines when it likes
+        for line in [json_text(with_notes(record))] if arguments.json else [
+                *lines, *(f'{x} written' for x in written if x is not None)]:
+            print(line)
     return 0
 
 

@@ -1,17 +1,20 @@
 """
 What a command prints besides its result: progress and notes; and its output in any locale.
 
-Progress of long operations is on standard error: on a terminal a bar, removed at the end;
-elsewhere, for operations of many seconds, a line for each activity, and for one that lasts a line
-about every two seconds. Assumptions and doubts of a command are told once each: as a line, and as
-a note in its JSON. Characters that the encoding of standard output lacks must not end a command.
+Progress is on standard error. No command is silent for long: from its start on, a thread says in a
+line what is under way, after each `PATIENCE` s without such a line. On a terminal, an operation
+whose share is known has a bar instead, removed at the end. Assumptions and doubts of a command are
+told once each: as a line, and as a note in its JSON. Characters that the encoding of standard
+output lacks must not end a command.
 """
 
 import codecs
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from functools import partial
 from io import TextIOWrapper
-import math
+import os
 import sys
 import threading
 import time
@@ -20,8 +23,10 @@ import warnings
 
 from hmsa.errors import AssumedWarning, MissingWarning, printable, UnusualWarning
 
-#: Seconds of silence after which `progress` says what is under way.
+#: Time in s of silence after which it is said what is under way: with the start of Python below
+#: 2 s. What lasts more than a minute is told less often, by a share of the time it has lasted.
 PATIENCE = 1.5
+_SHARE = 0.025
 
 _KINDS = AssumedWarning, UnusualWarning, MissingWarning
 _said: list[str] = []
@@ -34,61 +39,111 @@ _PLAIN = {
 _NAME = 'hmsa_plain'
 
 
-@contextmanager
-def progress(
-        what: str = 'starting', *, lines: float = math.inf, at_once: bool = False
-) -> Iterator[Callable[[str, float | None], None]]:
-    """
-    Yield a function of the current activity and the completed fraction or None.
+@dataclass(eq=False)
+class _Activity:
+    """What is under way since a time; nothing is said of it without words."""
 
-    Where no bar can be shown, a line says the activity that is under way after ``lines`` s, each
-    later one, and how long one has lasted after every ``lines`` s more: what fails at once leaves
-    its error alone. With ``at_once`` the first activity gets its line immediately.
+    words: str
+    since: float = field(default_factory=time.monotonic)
+
+
+class _Teller:
+    """A thread that says what is under way."""
+
+    def __init__(self) -> None:
+        self.activities: list[_Activity] = []  # each within the one before
+        self._spoken, self._begun = time.monotonic(), False
+        self._done = threading.Event()
+        self._thread = threading.Thread(target=self._wait, daemon=True)
+
+    def start(self) -> None:
+        """Begin to tell of the activities."""
+        self._thread.start()
+
+    def end(self) -> None:
+        """Say no more, so that no line comes after the result."""
+        self._done.set()
+        self._thread.join()
+
+    def change(self, activity: _Activity, words: str) -> None:
+        """Change the words of an activity."""
+        # Figures in parentheses change all the time.
+        new = words.partition(' (')[0] != activity.words.partition(' (')[0]
+        activity.words = words
+        if new:
+            activity.since = time.monotonic()
+            self.tell_change()
+
+    def tell_change(self) -> None:
+        """Say the innermost activity, which is new, if others were said."""
+        if self._begun:
+            self._say()
+
+    def _say(self, after: str = '') -> None:
+        self._spoken = time.monotonic()
+        if (words := self.activities[-1].words) and sys.stderr is not None:
+            self._begun = True
+            with suppress(OSError, ValueError):  # nobody reads it any more
+                print(f'{words}{after} ...', file=sys.stderr, flush=True)
+
+    def _wait(self) -> None:
+        while True:
+            lasted = time.monotonic() - self.activities[-1].since
+            due = self._spoken + max(PATIENCE, _SHARE * lasted)
+            if self._done.wait(max(due - time.monotonic(), 0.0)):
+                return
+            if time.monotonic() >= due:
+                since = self.activities[-1].since
+                self._say(f', {time.monotonic() - since:.0f} s' if self._begun else '')
+
+
+_tellers: list[_Teller] = []
+
+
+@contextmanager
+def under_way(words: str = '') -> Iterator[Callable[[str], None]]:
     """
+    Have it said what is under way, again and again; yield a function that changes the words.
+
+    Within another activity it takes its place until its end. Without words nothing is said, as
+    where a command talks itself.
+    """
+    own = not _tellers
+    if own:
+        _tellers.append(_Teller())
+    teller, activity = _tellers[0], _Activity(words)
+    teller.activities.append(activity)
+    if own:
+        teller.start()
+    else:
+        teller.tell_change()
+    try:
+        yield partial(teller.change, activity)
+    finally:
+        if own:
+            _tellers.clear()
+            teller.end()
+        teller.activities.remove(activity)
+
+
+@contextmanager
+def progress(what: str = 'starting') -> Iterator[Callable[[str, float | None], None]]:
+    """Yield a function of the current activity and the completed fraction or None."""
+    # Not asked of Rich, which takes a notebook with FORCE_COLOR for a terminal.
+    if not (sys.stderr is not None and sys.stderr.isatty()) or os.environ.get('TERM') == 'dumb':
+        with under_way(what) as change:
+            yield lambda what, share: change(what)
+        return
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-    console = Console(stderr=True)
-    # Tested with the file, since FORCE_COLOR in notebooks makes Rich assume a terminal.
-    bar = sys.stderr.isatty() and not console.is_dumb_terminal
-    present, begun = what, False
-    since = spoken = time.monotonic()
-    done = threading.Event()
-
-    def say(after: str = '') -> None:
-        nonlocal begun, spoken
-        begun, spoken = True, time.monotonic()
-        print(f'{present}{after} ...', file=sys.stderr, flush=True)
-
-    def wait() -> None:
-        while not done.wait(max(spoken + lines - time.monotonic(), 0.0)):
-            now = time.monotonic()
-            if now >= spoken + lines:
-                say(f', {now - since:.0f} s' if begun else '')
-
-    def change(what: str) -> None:
-        nonlocal present, since
-        # Figures in parentheses change all the time.
-        new = what.partition(' (')[0] != present.partition(' (')[0]
-        present = what
-        if new:
-            since = time.monotonic()
-            if begun:
-                say()
-
-    waiter = None if bar or math.isinf(lines) else threading.Thread(target=wait, daemon=True)
-    if waiter is not None:
-        if at_once:
-            say()
-        waiter.start()
-    with Progress(
+    with under_way(), Progress(
             TextColumn('{task.description:<28}'), BarColumn(), TextColumn('{task.fields[share]}'),
-            TimeElapsedColumn(), console=console, transient=True, disable=not bar) as shown:
+            TimeElapsedColumn(), console=Console(stderr=True), transient=True) as shown:
         # Without a total, the bar only shows activity.
         task = shown.add_task(what, total=None, share='     ')
 
         def update(what: str, share: float | None) -> None:
-            change(what)
             if share is None:
                 shown.update(task, description=what, total=None, share='     ')
             else:
@@ -96,12 +151,7 @@ def progress(
                     task, description=what, total=1.0, completed=share,
                     share=f'{100.0 * share:>3.0f} %')
 
-        try:
-            yield update
-        finally:
-            done.set()
-            if waiter is not None:
-                waiter.join()  # no line after the result
+        yield update
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from typing import Any, TYPE_CHECKING
 
 from hmsa.cli.options import add_command, assume_example, JSON, Row, show
 from hmsa.cli.pictures import paper_of, picture_options
-from hmsa.cli.terminal import PATIENCE, progress
+from hmsa.cli.terminal import progress, under_way
 from hmsa.errors import BadInputError, HmsaError
 from hmsa.files import check_targets, write_text, yaml_text
 from hmsa.interfaces.quantities import quantity_of
@@ -211,7 +211,7 @@ def _readings(arguments: argparse.Namespace) -> 'tuple[Array, Array]':
 
 def _typed(current: float) -> float:
     """Ask until a reading is valid; raise `HmsaError` at the end of the input."""
-    with redirect_stdout(sys.stderr):  # the question is not a result
+    with redirect_stdout(sys.stderr), under_way():  # the question is not a result
         while True:
             try:
                 return quantity_of(
@@ -332,7 +332,7 @@ def _latency(arguments: argparse.Namespace) -> int:
         assume_example()
     probe = _made(f'{_SIMULATED}SimulatedProbe', '--simulate') if arguments.simulate else (
         None if arguments.probe is None else _made(arguments.probe, '--probe'))
-    with _bench(name, arguments) as bench, progress(lines=PATIENCE) as update:
+    with _bench(name, arguments) as bench, progress() as update:
         scale = _scale(bench)
         found = measure_delays(
             bench, steps_of(actuator, arguments.limit, arguments.steps), probe, actuator,
@@ -383,7 +383,7 @@ def _static(arguments: argparse.Namespace) -> int:
     from hmsa_lab.experiments.calibrating import hold_staircase
 
     gauge = None if arguments.gauge is None else _made(arguments.gauge, '--gauge')
-    with _bench(name, arguments) as bench, progress(lines=PATIENCE) as update:
+    with _bench(name, arguments) as bench, progress() as update:
         scale = _scale(bench)
         level, stretch, length, drift = hold_staircase(
             bench, arguments.limit, arguments.steps, arguments.settle,

@@ -14,7 +14,7 @@ import sys
 from typing import Any
 
 from hmsa.cli.options import add_command, frequency, JSON, show
-from hmsa.cli.terminal import PATIENCE, progress
+from hmsa.cli.terminal import progress
 from hmsa.errors import BadInputError
 from hmsa.files import check_targets, write_text
 
@@ -47,8 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
     """
     check_targets(arguments.report)
     settings = settings_of(arguments)
-    # The module takes a second to import.
-    with progress(f'loading {arguments.hardware}', lines=PATIENCE, at_once=True) as update:
+    with progress(f'loading {arguments.hardware}') as update:
         from hmsa_lab.bench.conformance import ConformanceTrial
 
         found = ConformanceTrial(

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from hmsa.cli.options import add_command, assume_example, frequency, JSON, show
-from hmsa.cli.terminal import PATIENCE, progress
+from hmsa.cli.terminal import progress
 from hmsa.files import check_targets, write_text
 from hmsa.table import Column, Table
 
@@ -57,7 +57,7 @@ def run(arguments: argparse.Namespace) -> int:
     belief = read_belief(arguments.params_file)
     if arguments.params_file is None:
         assume_example()
-    with progress('designing the sequence', lines=PATIENCE):
+    with progress('designing the sequence'):
         found = excite(
             belief.actuator, Bounds.of(belief, arguments.stretch_min, arguments.stretch_max),
             duration=arguments.duration, rate=arguments.rate, noise=arguments.noise,

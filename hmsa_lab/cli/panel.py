@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from hmsa.cli.options import add_command, JOINTS, NAMESPACE, setpoint_of_joints
+from hmsa.cli.terminal import under_way
 from hmsa.ending import ENDING
 from hmsa.errors import BadInputError
 
@@ -54,5 +55,6 @@ def run(arguments: argparse.Namespace) -> int:
             server, setpoint_of_joints, arguments.out, arguments.namespace,
             tuple(arguments.joint.split(',')), span, stop_on_close=arguments.stop_on_close)
         print(f'panel: {server.address}', flush=True)
-        desk.run()
+        with under_way():
+            desk.run()
     return 0

@@ -23,7 +23,7 @@ from hmsa.cli.options import (
     setpoint_of_joints,
     show,
 )
-from hmsa.cli.terminal import PATIENCE, progress, show_notes
+from hmsa.cli.terminal import progress, show_notes
 from hmsa.ending import ENDING
 from hmsa.errors import BadInputError
 from hmsa.files import check_targets, write_text
@@ -95,7 +95,7 @@ def run(arguments: argparse.Namespace) -> int:
         node, arguments.namespace, arguments.duration, arguments.stretch_min,
         arguments.stretch_max, arguments.free, known, uncertain, arguments.accept)
     try:
-        with progress(lines=PATIENCE) as update:
+        with progress() as update:
             found = tune(tuning, update)
     except KeyboardInterrupt:
         return ENDING.status

@@ -10,11 +10,11 @@ example: hmsa watch --joint actuator
 
 import argparse
 import json
-import sys
 from time import monotonic, sleep
 from typing import Any, TYPE_CHECKING
 
 from hmsa.cli.options import add_command
+from hmsa.cli.terminal import under_way
 from hmsa.ending import ENDING
 from hmsa.errors import BadInputError
 
@@ -25,8 +25,6 @@ if TYPE_CHECKING:
 # Interval of lines, and of looks in between, in s.
 _LINE_SECONDS = 1.0
 _LOOK_SECONDS = 0.1
-# Time in s of waiting after which it is said what is awaited.
-_QUIET_SECONDS = 1.0
 
 
 def add_parser(subparsers: Any) -> None:
@@ -55,29 +53,26 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.once:
             return _once(listener, arguments)
         due = monotonic() + _LINE_SECONDS
-        while not ENDING.asked:
-            sleep(min(_LOOK_SECONDS, max(due - monotonic(), 0.0)))
-            scene = listener.look()
-            if monotonic() >= due:
-                due += _LINE_SECONDS
-                _print(scene, arguments.json)
+        with under_way():
+            while not ENDING.asked:
+                sleep(min(_LOOK_SECONDS, max(due - monotonic(), 0.0)))
+                scene = listener.look()
+                if monotonic() >= due:
+                    due += _LINE_SECONDS
+                    _print(scene, arguments.json)
     return 0
 
 
 def _once(listener: 'Listener', arguments: argparse.Namespace) -> int:
     """Print one line once it is complete, or after the timeout."""
-    begin, said = monotonic(), False
-    scene = listener.look()
-    # At least two looks, to determine the sample rate.
-    while not (scene.joints and scene.request and scene.sample_rate > 0.0):
-        if monotonic() >= begin + arguments.timeout or ENDING.asked:
-            break
-        if not said and monotonic() >= begin + _QUIET_SECONDS:
-            said = True
-            print(f'hmsa: note: waiting up to {arguments.timeout:g} s for samples and a status',
-                  file=sys.stderr, flush=True)
-        sleep(_LOOK_SECONDS)
-        scene = listener.look()
+    begin, scene = monotonic(), listener.look()
+    with under_way(f'waiting up to {arguments.timeout:g} s for samples and a status'):
+        # At least two looks, to determine the sample rate.
+        while not (scene.joints and scene.request and scene.sample_rate > 0.0):
+            if monotonic() >= begin + arguments.timeout or ENDING.asked:
+                break
+            sleep(_LOOK_SECONDS)
+            scene = listener.look()
     _print(scene, arguments.json)
     return 0 if scene.joints or scene.request else 1
 

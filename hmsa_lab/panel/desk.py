@@ -206,7 +206,7 @@ class Desk:
         finally:
             if self._stop_on_close and self._moves and (
                     failure := self._client.try_to_stop()):
-                self._client.say(failure)
+                print(f'hmsa: note: {failure}', file=sys.stderr, flush=True)
             self._recording.close()
             self._listener.__exit__()
             self._client.__exit__()

@@ -15,7 +15,7 @@ import sys
 from typing import Any
 
 from hmsa.cli.options import add_command, show
-from hmsa.cli.terminal import PATIENCE, progress
+from hmsa.cli.terminal import progress
 from hmsa.ending import ENDING
 from hmsa.table import Column, Table
 
@@ -40,7 +40,7 @@ def run(arguments: argparse.Namespace) -> int:
     ENDING.note()
     print(f'ROS_DOMAIN_ID {os.environ["ROS_DOMAIN_ID"]}, output in {folder}', file=sys.stderr)
     try:
-        with progress(lines=PATIENCE) as update:
+        with progress() as update:
             from hmsa_ros.clients.demo import run_demo
 
             result = run_demo(folder, update)

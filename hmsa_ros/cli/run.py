@@ -18,7 +18,7 @@ import sys
 from typing import Any, TYPE_CHECKING
 
 from hmsa.cli.options import add_command, assume_example, JOINTS, NAMESPACE, SEQUENCE, sequence_of
-from hmsa.cli.terminal import PATIENCE, progress, show_notes, with_notes
+from hmsa.cli.terminal import progress, show_notes, with_notes
 from hmsa.ending import ENDING
 from hmsa.errors import BadInputError
 from hmsa.files import json_text, write_text
@@ -81,7 +81,7 @@ def run(arguments: argparse.Namespace) -> int:
     # Each repeat has its own folder.
     folders = [folder] if arguments.repeat == 1 else [
         folder / str(i + 1) for i in range(arguments.repeat)]
-    with progress('reading the sequence', lines=PATIENCE):
+    with progress('reading the sequence'):
         experiments = [_experiment(arguments, x) for x in folders]
     for x in folders:
         prepare(x)
@@ -89,7 +89,7 @@ def run(arguments: argparse.Namespace) -> int:
     records, each, whole = [], [], True
     for experiment in experiments:
         try:
-            with progress(lines=PATIENCE) as update:
+            with progress() as update:
                 done, parts, report = _carried_out(arguments, experiment, tolerances, update)
         except KeyboardInterrupt:
             so_far = f'; the bag so far: {experiment.bag}' if experiment.bag.exists() else ''

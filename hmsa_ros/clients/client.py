@@ -14,6 +14,7 @@ from lifecycle_msgs.srv import GetState
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 
+from hmsa.cli.terminal import under_way
 from hmsa.ending import ENDING
 from hmsa.errors import BadInputError, HmsaError
 from hmsa.interfaces import topics
@@ -150,13 +151,13 @@ class PlannerClient(Link):
         try:
             end = monotonic() + (_FORGOTTEN_SECONDS if own else LATELY_SECONDS)
             # Killed nodes are still discovered, but inactive.
-            while duplicates.crowded(self._joints, topics.PLANNER) and monotonic() < end:
-                self.say('waiting to see whether a second planner, plant or driver has ended')
-                duplicates.look()
-                if found := (
-                        duplicates.planners(topics.PLANNER) or duplicates.devices(self._joints)):
-                    raise HmsaError(_OTHERS if own else found)
-                self.pass_time(SLICE_SECONDS)
+            with under_way('looking whether a second planner, plant or driver has ended'):
+                while duplicates.crowded(self._joints, topics.PLANNER) and monotonic() < end:
+                    duplicates.look()
+                    if found := (duplicates.planners(topics.PLANNER)
+                                 or duplicates.devices(self._joints)):
+                        raise HmsaError(_OTHERS if own else found)
+                    self.pass_time(SLICE_SECONDS)
             if own and duplicates.crowded(self._joints, topics.PLANNER):
                 raise HmsaError(_OTHERS)
         finally:
@@ -356,7 +357,8 @@ class PlannerClient(Link):
         with _slower_time(self.node, self._timeout) as time:
             self.spin_until(
                 done, 'the sequence has not finished',
-                None if each is None else lambda: each(self.verdict), timeout, time)
+                None if each is None else lambda: each(self.verdict), timeout, time,
+                'the end of the sequence')
         end = self.verdict
         if end.state != 'idle':
             # A refused request leaves the sequence alone, and is the last one in the status.

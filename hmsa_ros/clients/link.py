@@ -13,6 +13,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory
 
+from hmsa.cli.terminal import under_way
 from hmsa.ending import ENDING
 from hmsa.errors import HmsaError
 from hmsa.interfaces import topics
@@ -27,8 +28,6 @@ from hmsa_ros.nodes.temporary_node import SLICE_SECONDS, TemporaryNode
 _STOP_SECONDS = 15.0
 _AGAIN_SECONDS = 0.1
 _LOOK_SECONDS = 0.005
-# Time in s of a stop after which it is said what is awaited.
-_QUIET_SECONDS = 1.0
 
 # Codes of warnings that a stop has failed; others, as of a plan made anew, are not its end.
 _FAILED = (Code.SUPERSEDED, Code.VIBRATING)
@@ -111,16 +110,15 @@ class Link(TemporaryNode):
             If a signal requested the end meanwhile.
 
         """
-        asked, begin = ENDING.asked, monotonic()
-        stopping = Stopping(self)
-        while stopping.failure is None and stopping.done is None:
-            if not asked:
-                ENDING.check()
-            if monotonic() - begin > _QUIET_SECONDS:
-                self.say(stopping.words)
-            self._executor.spin_once(
-                timeout_sec=SLICE_SECONDS if stopping.answered else _LOOK_SECONDS)
-            stopping.go_on()
+        asked, stopping = ENDING.asked, Stopping(self)
+        with under_way(stopping.words) as change:
+            while stopping.failure is None and stopping.done is None:
+                if not asked:
+                    ENDING.check()
+                change(stopping.words)
+                self._executor.spin_once(
+                    timeout_sec=SLICE_SECONDS if stopping.answered else _LOOK_SECONDS)
+                stopping.go_on()
         if stopping.done is None:
             raise HmsaError(stopping.failure or '')
         return stopping.done

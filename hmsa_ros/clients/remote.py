@@ -29,7 +29,7 @@ def _ask(
         ServiceCall(client.node, kind, f'{name}/{service}', kind.Request(**request)),
         f'no node {name} in namespace {client.node.get_namespace()} replies: expected '
         'one that runs, with the same ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE as here',
-        each, f'a reply of node {name} in namespace {client.node.get_namespace()}: does it run?')
+        each, f'a reply of node {name} in namespace {client.node.get_namespace()} (does it run?)')
 
 
 def remote_parameters(

@@ -1,9 +1,9 @@
 """Start of ROS in a process, and temporary nodes of commands that inspect a running system."""
 
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 import os
 import re
-import sys
 from time import monotonic
 from typing import Any, TypeVar
 from uuid import uuid4
@@ -16,6 +16,7 @@ from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 from rclpy.validate_namespace import validate_namespace
 
+from hmsa.cli.terminal import under_way
 from hmsa.ending import ENDING
 from hmsa.errors import BadInputError, HmsaError
 from hmsa_ros.middleware import prepare_middleware
@@ -25,9 +26,6 @@ T = TypeVar('T')
 #: Maximum time in s of one wait for callbacks.
 SLICE_SECONDS = 0.05
 _LAST_DOMAIN = 232
-# Time in s of waiting after which it is said what is awaited, with the start of the process below
-# 2 s.
-_QUIET_SECONDS = 1.0
 
 
 def start_ros(
@@ -83,7 +81,7 @@ class TemporaryNode:
     """A node of `visit` with a default timeout in s; a context manager."""
 
     def __init__(self, name: str, namespace: str, timeout: float) -> None:
-        self._timeout, self._said = timeout, ''
+        self._timeout = timeout
         # Nobody asks it for parameters or types; the services take a third of its start.
         self.node = visit(
             name, namespace, start_parameter_services=False, parameter_overrides=[
@@ -105,7 +103,7 @@ class TemporaryNode:
         """
         Serve callbacks, and call ``each`` about 20 times a second, until a condition is true.
 
-        If it takes long, a line on standard error says what is ``awaited``, if that is given.
+        While it takes long, lines on standard error say what is ``awaited``, if that is given.
 
         Raises
         ------
@@ -116,23 +114,15 @@ class TemporaryNode:
 
         """
         timeout = self._timeout if timeout is None else timeout
-        deadline, quiet = time() + timeout, monotonic() + _QUIET_SECONDS
-        while not condition():
-            if awaited and monotonic() > quiet:
-                self.say(f'waiting up to {timeout:g} s for {awaited}')
-                awaited = ''
-            if time() > deadline:
-                raise HmsaError(f'waited {timeout:g} s: {failure}')
-            ENDING.check()
-            self._executor.spin_once(timeout_sec=SLICE_SECONDS)
-            if each is not None:
-                each()
-
-    def say(self, words: str) -> None:
-        """Print a note on standard error, once in a row."""
-        if words != self._said:
-            print(f'hmsa: note: {words}', file=sys.stderr, flush=True)
-        self._said = words
+        deadline = time() + timeout
+        with under_way(f'waiting up to {timeout:g} s for {awaited}') if awaited else nullcontext():
+            while not condition():
+                if time() > deadline:
+                    raise HmsaError(f'waited {timeout:g} s: {failure}')
+                ENDING.check()
+                self._executor.spin_once(timeout_sec=SLICE_SECONDS)
+                if each is not None:
+                    each()
 
     def ask(
             self, call: ServiceCall, failure: str, each: Callable[[], None] | None = None,

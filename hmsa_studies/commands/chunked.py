@@ -8,6 +8,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from hmsa.cli.options import Row
+from hmsa.cli.terminal import under_way
 from hmsa.errors import BadInputError
 
 if TYPE_CHECKING:
@@ -93,7 +94,7 @@ def say(sentence: str) -> None:
 
 @contextmanager
 def progress(words: str, total: int) -> Iterator[Callable[[int], None]]:
-    """Show rows completed, rate and remaining time, only on a terminal."""
+    """Show rows completed, on a terminal with rate and remaining time."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -109,10 +110,18 @@ def progress(words: str, total: int) -> Iterator[Callable[[int], None]]:
         def render(self, task: Task) -> Text:
             return Text(f'{task.speed:,.{0 if task.speed > 10.0 else 1}f}/s' if task.speed else '')
 
-    console = Console(stderr=True)
-    with Progress(
+    console, done = Console(stderr=True), 0
+    with under_way('' if console.is_terminal else words) as change, Progress(
             TextColumn(words), BarColumn(), MofNCompleteColumn(), Rate(''),
             TimeRemainingColumn(), console=console, transient=True,
             disable=not console.is_terminal) as shown:
         task = shown.add_task('', total=total)
-        yield lambda rows: shown.advance(task, rows)
+
+        def advance(rows: int) -> None:
+            nonlocal done
+            done += rows
+            shown.advance(task, rows)
+            if not console.is_terminal:
+                change(f'{words} ({done:,} of {total:,})')
+
+        yield advance

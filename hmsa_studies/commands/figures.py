@@ -13,7 +13,7 @@ from typing import Any
 
 from hmsa.cli.options import add_command
 from hmsa.cli.pictures import formats_of, paper_of, picture_options
-from hmsa.cli.terminal import PATIENCE, progress
+from hmsa.cli.terminal import progress
 from hmsa.files import make_folder
 
 
@@ -36,7 +36,7 @@ def run(arguments: argparse.Namespace) -> int:
     from hmsa_studies.paper import FIGURES, write_figure
 
     written: list[Path] = []
-    with progress(lines=PATIENCE) as update:
+    with progress() as update:
         for i, (number, figure) in enumerate(FIGURES.items()):
             update(f'Figure {number}', i / len(FIGURES))
             written += write_figure(figure, folder, paper=paper, kinds=kinds)

@@ -21,7 +21,7 @@ from typing import Any, TYPE_CHECKING
 from hmsa.cli.options import add_command, MATERIAL
 from hmsa.cli.pictures import formats_of, paper_of, picture_options
 from hmsa.cli.plan import nominal
-from hmsa.cli.terminal import PATIENCE, progress
+from hmsa.cli.terminal import progress
 from hmsa.errors import BadInputError
 from hmsa.files import json_text, make_folder
 from hmsa_studies.commands import chunked
@@ -158,7 +158,7 @@ def _write(
     write_csv(files[0], studies)
     drawn = [named(folder, f'robustness_{case.start:g}_to_{case.target:g}', kinds)
              for case, _ in studies]
-    with progress('drawing', lines=PATIENCE) as update:
+    with progress('drawing') as update:
         for i, (paths, study) in enumerate(zip(drawn, studies, strict=True)):
             update('drawing', i / (len(studies) + 1))
             draw_robustness(paths, *study, paper)

@@ -21,7 +21,7 @@ from typing import Any, TYPE_CHECKING
 
 from hmsa.cli.options import add_command, MATERIAL
 from hmsa.cli.pictures import formats_of, paper_of, picture_options
-from hmsa.cli.terminal import PATIENCE, progress
+from hmsa.cli.terminal import progress
 from hmsa.errors import BadInputError
 from hmsa.report.paper import named, Paper
 from hmsa_studies.commands import chunked
@@ -251,7 +251,7 @@ def _plan_at_once(sweep: 'Sweep', out: Path | None, picture: _SweepPicture) -> i
             counts.update(block.status.tolist())
             advance(block.status.size)
     _report(sweep.size, counts)
-    with progress('drawing', lines=PATIENCE):
+    with progress('drawing'):
         pictures = picture.draw()
     if out is not None:
         print(out, *pictures, sep='\n')
@@ -273,7 +273,7 @@ def _plan_in_chunks(
 
     def finish(computed: int) -> int:
         _report(sweep.size, folder.merge(table, picture.add))
-        with progress('drawing', lines=PATIENCE):
+        with progress('drawing'):
             pictures = picture.draw(changed=computed > 0)
         if table.parent.resolve() != folder.folder and arguments.shard is None:
             shutil.rmtree(folder.folder, ignore_errors=True)
