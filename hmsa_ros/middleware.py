@@ -1,10 +1,20 @@
-"""Middleware settings of this package's processes, unless the user has set others."""
+"""
+Middleware settings of this package's processes, unless the user has set others; addresses.
+
+The middleware announces the addresses that the host had when a node started. Nodes on other hosts
+do not find the node at another address, however long both run.
+"""
 
 import os
 from pathlib import Path
 import re
+import socket
+import struct
 import sys
 import sysconfig
+
+if sys.platform == 'linux':
+    import fcntl
 
 #: Environment variable of ROS 2, whose own default is SUBNET.
 RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
@@ -19,6 +29,10 @@ _HERE = Path(__file__).parent
 # generator itself, without which the package works, brings parsers: a fifth of the start of
 # `hmsa stop`.
 _GENERATOR = 'rosidl_generator_py.generate_py_impl'
+# Request of ioctl for the IPv4 address of an interface, and its place in the answer.
+_SIOCGIFADDR, _PLACE = 0x8915, slice(20, 24)
+# Values of RANGE with which no node of another host is found.
+_ALONE = ('LOCALHOST', 'OFF')
 
 
 def ros_distro() -> str:
@@ -60,3 +74,43 @@ def fast_dds() -> int:
 def profiles(version: int, *, local: bool) -> Path:
     """Return the profiles of a major version of Fast DDS, for nodes of this host or of several."""
     return _HERE / f'fastdds{version if version > 2 else ""}{"_localhost" if local else ""}.xml'
+
+
+def addresses() -> frozenset[str]:
+    """Return the IPv4 addresses of this host to others; empty for none, or if unknown."""
+    if sys.platform != 'linux':
+        return frozenset()
+    found = set()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as channel:
+        for _, name in socket.if_nameindex():
+            try:
+                answer = fcntl.ioctl(
+                    channel.fileno(), _SIOCGIFADDR, struct.pack('256s', name.encode()[:15]))
+            except OSError:
+                # It has no address.
+                continue
+            found.add(socket.inet_ntoa(answer[_PLACE]))
+    return frozenset(x for x in found if not x.startswith('127.'))
+
+
+class AddressWatch:
+    """Compare the addresses of this host with those at the start of a node."""
+
+    def __init__(self) -> None:
+        self._begun = addresses()
+
+    @property
+    def words(self) -> str:
+        """What a change of address leads to, and the remedy; empty for none."""
+        if os.environ.get(RANGE, '').upper() in _ALONE:
+            return ''
+        now = addresses()
+        gone, new = self._begun - now, now - self._begun
+        if not new or self._begun and not gone:
+            # During an outage there may be none, and further ones do no harm.
+            return ''
+        before = ', '.join(sorted(gone)) or 'none'
+        return (
+            f'the address of this host was {before} when this node started, and is '
+            f'{", ".join(sorted(new))} now: nodes on other hosts do not find this one any more; '
+            'restart the nodes on this host')

@@ -4,8 +4,8 @@ from diagnostic_msgs.msg import DiagnosticArray
 import pytest
 
 from hmsa.interfaces import topics
-from hmsa_ros.nodes import address
-from hmsa_ros.nodes.address import addresses, AddressWatch
+from hmsa_ros import middleware
+from hmsa_ros.middleware import addresses, AddressWatch
 from hmsa_ros.nodes.planner import PlannerNode
 
 HOME, CAFE, BRIDGE = '192.168.1.7', '10.0.0.9', '172.17.0.1'
@@ -15,7 +15,7 @@ HOME, CAFE, BRIDGE = '192.168.1.7', '10.0.0.9', '172.17.0.1'
 def moves(monkeypatch):
     """Return a function that changes the addresses of this host."""
     def move(*now):
-        monkeypatch.setattr(address, 'addresses', lambda: frozenset(now))
+        monkeypatch.setattr(middleware, 'addresses', lambda: frozenset(now))
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'SUBNET')
     return move
 

@@ -73,7 +73,7 @@ def test_a_stop_beside_another_client_is_sent_before_anything_else_is_known(
     monkeypatch.setattr(node._runtime, 'request', requests.append)
     with Link() as link:
         # The planner never answers, and its last status is on the request of another client.
-        monkeypatch.setattr(link, '_timeout', 5.0)
+        monkeypatch.setattr(link, 'timeout', 5.0)
         failure = link.try_to_stop()
     assert len(requests) > 1
     assert len({x.name for x in requests}) == 1

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from hmsa.errors import BadInputError
-from hmsa_lab.bench.readings import Readings
-from hmsa_lab.nodes.sense import reader
+from hmsa_lab.nodes.sense import reader, Readings
 from hmsa_ros.nodes.ros_entities import interface_class
 
 START, MS = 1_700_000_000 * 10**9, 1_000_000

@@ -110,7 +110,7 @@ class PlannerClient(Link):
 
         self.spin_until(
             settled, 'the planner does not subscribe to requests', each,
-            max(self._timeout, _LISTENS_SECONDS),
+            max(self.timeout, _LISTENS_SECONDS),
             awaited='the planner, which is starting or cannot be reached')
         state.close()
         self.spin_until(found, failure, each, awaited='the planner to take requests')
@@ -231,7 +231,7 @@ class PlannerClient(Link):
             If the planner does not answer.
 
         """
-        deadline = monotonic() + self._timeout
+        deadline = monotonic() + self.timeout
         while True:
             request = self.publish(setpoints, levels, path)
             self.spin_until(
@@ -354,7 +354,7 @@ class PlannerClient(Link):
                 raise HmsaError(f'the sequence is not carried out: {now.unheard}')
             return ended and not now.unheard
 
-        with _slower_time(self.node, self._timeout) as time:
+        with _slower_time(self.node, self.timeout) as time:
             self.spin_until(
                 done, 'the sequence has not finished',
                 None if each is None else lambda: each(self.verdict), timeout, time,

@@ -75,11 +75,6 @@ class Link(TemporaryNode):
             f'no planner in namespace {self._namespace or "/"}; start one with hmsa planner, with '
             'the same ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE as here')
 
-    @property
-    def timeout(self) -> float:
-        """Time in s to wait for the planner."""
-        return self._timeout
-
     def publish_stop(self, name: str) -> None:
         """Send a stop of a name."""
         self._publisher.publish(JointTrajectory(header=Header(frame_id=name)))

@@ -93,8 +93,9 @@ class LinkedPlanner(PlannerNode):
         if self._seen is not None:
             joints, sample = self._seen
             self._seen = None
-            for name, stretch, rate, flux_density in _each(joints, sample):
-                yield name, ObservedSample(sample.time, stretch, rate, flux_density)
+            for name, *measured in zip(
+                    joints, *(x.tolist() for x in sample[1:]), strict=True):
+                yield name, ObservedSample(sample.time, *measured)
 
     def now(self) -> int:
         """Return the time in ns, from the plant if that publishes the clock."""
@@ -258,13 +259,6 @@ class LinkedPlant(Linked, PlantNode):
 
 class LinkedDriver(Linked, DriverNode):
     """A driver of hardware commanded by a planner in the same process."""
-
-
-def _each(joints: Sequence[str], sample: Sample) -> Iterator[tuple[str, float, float, float]]:
-    """Yield name, stretch, rate and flux density of each joint."""
-    return zip(
-        joints, sample.stretch.tolist(), sample.rate.tolist(), sample.flux_density.tolist(),
-        strict=True)
 
 
 def make() -> Sequence[Node]:

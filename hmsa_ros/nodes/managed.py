@@ -23,8 +23,8 @@ from rosgraph_msgs.msg import Clock
 from hmsa.errors import BadInputError, HmsaError
 from hmsa.interfaces import topics
 from hmsa.interfaces.parameters import ParameterSpec
+from hmsa_ros.middleware import AddressWatch
 from hmsa_ros.nodes import ros_entities
-from hmsa_ros.nodes.address import AddressWatch
 from hmsa_ros.nodes.capture import FastPublisher
 from hmsa_ros.nodes.conversions import to_diagnostics, to_status
 from hmsa_ros.nodes.parameters import (

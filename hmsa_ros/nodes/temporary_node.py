@@ -81,7 +81,7 @@ class TemporaryNode:
     """A node of `visit` with a default timeout in s; a context manager."""
 
     def __init__(self, name: str, namespace: str, timeout: float) -> None:
-        self._timeout = timeout
+        self.timeout = timeout
         # Nobody asks it for parameters or types; the services take a third of its start.
         self.node = visit(
             name, namespace, start_parameter_services=False, parameter_overrides=[
@@ -113,7 +113,7 @@ class TemporaryNode:
             If a signal requested the end.
 
         """
-        timeout = self._timeout if timeout is None else timeout
+        timeout = self.timeout if timeout is None else timeout
         deadline = time() + timeout
         with under_way(f'waiting up to {timeout:g} s for {awaited}') if awaited else nullcontext():
             while not condition():

@@ -293,7 +293,9 @@ class CommandLink:
         apart = offset.least > lead or -offset.most > max(lead, settings.takeover_max_age)
         spoilt = abs(step) - offset.error > lead and (planner.moves(now) or planner.pending)
         if before or apart or spoilt:
-            self._restart_times(joint)
+            # Times of its clock from before it was set.
+            self._takeover.forget(joint)
+            self._deviations.forget_times(joint)
         if not apart:
             self.apart.discard(joint)
         elif not before:
@@ -320,11 +322,6 @@ class CommandLink:
         level = self._deviations.newest.get(joint)
         if level is not None and self._takeover.engaged and joint not in self.cut | self.open:
             self._hand_out(joint, now + offset.ahead, level[1], now)
-
-    def _restart_times(self, joint: str) -> None:
-        """Discard times of a device's clock from before it was set."""
-        self._takeover.forget(joint)
-        self._deviations.forget_times(joint)
 
     def _dropped(self, joint: str, code: Code, words: str) -> Verdict:
         """Have the next request start from a sample; return the verdict on a dropped plan."""

@@ -73,11 +73,6 @@ class DeviceClock:
         """Smallest age of receipts at arrival; None for no receipt."""
         return min((-x for _, x in self._received), key=abs, default=None)
 
-    @property
-    def round_trip(self) -> int:
-        """Smallest time from a command to its receipt; 0 if unknown."""
-        return 2 * self._best.error if self._exchanges else 0
-
     def sent(self, stamp: int, now: int) -> None:
         """Record that a command was sent; timestamp and time of the planner's clock."""
         self._sent[stamp] = now

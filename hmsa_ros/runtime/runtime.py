@@ -85,7 +85,7 @@ class Runtime:
         self.follower = Follower(group, settings)
         self._takeover = Takeover(
             group.planners, around, receipts, self.deviations.newest,
-            self._follows, self._note)
+            self.follower, self._note)
         self._silence = SampleTimeout(around)
         self._watch = ArrivalMonitor(group, around, self.follower, self._outputs.append)
         self.devices = CommandLink(
@@ -119,10 +119,8 @@ class Runtime:
             self.follower = feedback(
                 self.group, self.settings, self._outputs, self._clock, self._report_ended,
                 self.follower.doing)
-            self.planning.follower = self._watch.follower = self.follower
-
-    def _follows(self, joint: str) -> bool:
-        return self.follower.follows(joint)
+            self.planning.follower = self._watch.follower = self._takeover.follower = (
+                self.follower)
 
     def _note(self, words: str) -> None:
         self._outputs.append(Note(Severity.WARN, words))

@@ -10,6 +10,7 @@ from hmsa.judge.stillness import Stillness
 from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.planner import Planner
+from hmsa_ros.runtime.follower import Follower
 from hmsa_ros.runtime.receipts import Receipts
 from hmsa_ros.runtime.records import Environment, ObservedSample, Settings
 
@@ -41,16 +42,17 @@ class Takeover:
 
     def __init__(
             self, planners: Mapping[str, Planner], environment: Environment, receipts: Receipts,
-            newest: Mapping[str, tuple[int, float]], followed: Callable[[str], bool],
+            newest: Mapping[str, tuple[int, float]], follower: Follower,
             note: Callable[[str], None]) -> None:
         """
         Begin with unknown positions.
 
-        ``newest`` contains timestamp in ns and level in T of the newest change of each joint. A
-        joint that feedback has ``followed`` is left to feedback.
+        ``newest`` contains timestamp in ns and level in T of the newest change of each joint.
         """
         self._planners, self._around, self._receipts = planners, environment, receipts
-        self._newest, self._followed, self._note = newest, followed, note
+        self._newest, self._note = newest, note
+        #: A joint that it follows is left to it; feedback may take its place.
+        self.follower = follower
         self._until: int | None = None
         # Whether the positions of the joints are known, or assumed at rest.
         self.engaged = False
@@ -229,7 +231,7 @@ class Takeover:
         clock.
         """
         for name in sorted(self._unsure):
-            if name not in self._doubted and self._followed(name):
+            if name not in self._doubted and self.follower.follows(name):
                 continue
             seen = self._samples.get(name)
             if seen is None or not self._around.observable():
