@@ -7,6 +7,7 @@ obvious, the remedy.
 
 from collections.abc import Iterable
 from difflib import get_close_matches
+import math
 import reprlib
 import sys
 import warnings
@@ -68,6 +69,36 @@ def meant(word: object, known: Iterable[str]) -> str:
     """Return ``; did you mean NAME?`` with the known name closest to a word, or nothing."""
     near = get_close_matches(str(word), list(known), 1)
     return f'; did you mean {near[0]}?' if near else ''
+
+
+def check_choice(what: str, value: object, choices: Iterable[str]) -> None:
+    """Raise `BadInputError`, with the closest name, if a value is not one of some names."""
+    names = list(choices)
+    if not isinstance(value, str) or value not in names:
+        raise BadInputError(
+            f'{what} is {excerpt(value)}: expected one of {", ".join(names)}{meant(value, names)}')
+
+
+def check_number(
+        what: str, value: float, unit: str = '', *, least: float = -math.inf,
+        above: float = -math.inf, most: float = math.inf, endless: bool = False) -> None:
+    """
+    Raise `BadInputError` if a number is out of bounds, or not finite.
+
+    The bounds ``least`` and ``most`` are allowed, ``above`` is not; ``endless`` allows inf.
+    """
+    if least <= value <= most and above < value and (endless or math.isfinite(value)):
+        return
+    unit = f' {unit}' if unit else ''
+    if least > -math.inf and most < math.inf:
+        expected = f'{least:g} to {most:g}{unit}'
+    else:
+        expected = 'a finite number' + (
+            f' of at least {least:g}{unit}' if least > -math.inf
+            else f' above {above:g}{unit}' if above > -math.inf else '') + (
+            f' and at most {most:g}{unit}' if most < math.inf else '') + (
+            ', or inf' if endless else '')
+    raise BadInputError(f'{what} is {value:g}{unit}: expected {expected}')
 
 
 def assume(text: str, kind: type[Warning] = AssumedWarning) -> None:

@@ -19,7 +19,7 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from hmsa.errors import BadInputError
+from hmsa.errors import BadInputError, check_number
 from hmsa.model.equations import Array
 
 if TYPE_CHECKING:
@@ -219,8 +219,7 @@ def draw(
     if not 1 <= count <= MOST_VALUES // max(size, 1):
         raise BadInputError(
             f'{count:,} samples of {size} columns: expected 1 to {MOST_VALUES // max(size, 1):,}')
-    if seed < 0:
-        raise BadInputError(f'the seed of the samples is {seed}: expected at least 0')
+    check_number('the seed of the samples', seed, least=0)
     factor = _factor(belief)
     # A power of 2 keeps the sequence balanced.
     points = qmc.Sobol(size, seed=np.random.default_rng(seed)).random_base2(

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from hmsa.errors import BadInputError, HmsaError
+from hmsa.errors import BadInputError, check_number, HmsaError
 from hmsa.files import replacing
 from hmsa.model.delivery import Delivery, IDEAL
 from hmsa.model.equations import Array
@@ -58,9 +58,7 @@ class Candidate:
     def __post_init__(self) -> None:
         """Check shaper and order."""
         get_shaper(self.shaper)
-        if not 1 <= self.order <= MOST_ORDER:
-            raise BadInputError(
-                f'order of the shaper {self.shaper} is {self.order}: expected 1 to {MOST_ORDER}')
+        check_number(f'order of the shaper {self.shaper}', self.order, least=1, most=MOST_ORDER)
 
     @property
     def name(self) -> str:

@@ -14,7 +14,7 @@ import signal
 import threading
 from typing import Any, TypeVar
 
-from hmsa.errors import BadInputError, HmsaError
+from hmsa.errors import BadInputError, check_number, HmsaError
 from hmsa.planning.two_step import available_cores
 
 Result = TypeVar('Result')
@@ -86,8 +86,7 @@ def local(workers: int) -> Start:
         If the number is below 1.
 
     """
-    if workers < 1:
-        raise BadInputError(f'--workers is {workers}: expected at least 1')
+    check_number('--workers', workers, least=1)
     return here if workers == 1 else partial(local_processes, workers)
 
 

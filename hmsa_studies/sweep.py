@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hmsa.errors import BadInputError
+from hmsa.errors import BadInputError, check_choice
 from hmsa.files import require_arrow
 from hmsa.interfaces.parameters import LAW_NAME, present_name
 from hmsa.model.equations import Array, signed_root
@@ -132,9 +132,7 @@ class Sweep:
             {x: _checked(x, grids[x], ranges[x]) if x in grids else np.array([defaults[x]])}
             for x in ranges if x in grids or (x in defaults and x not in seen)]
         for law in laws:
-            if law not in LAWS:
-                raise BadInputError(
-                    f'law {law!r} is unknown: expected one of {", ".join(LAWS)}')
+            check_choice('law', law, LAWS)
             if not any(x.startswith('law.') for x in seen):
                 # Report invalid constants here if no row can have them.
                 self._system.setting({**defaults, LAW_NAME.name: law})

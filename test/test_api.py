@@ -237,7 +237,7 @@ def test_what_cannot_be_identified_says_why(block, tmp_path):
     (lambda x: hmsa.Actuator(creep=0.1), r'branches of creep have the shape \(\)'),
     (lambda x: hmsa.Actuator(law='yeoh', shear_modulus=1e4), 'whose constants it follows'),
     (lambda x: hmsa.Actuator(flux_density_limits=(1, -1)), 'the minimum below the maximum'),
-    (lambda x: hmsa.Actuator(slew_limit=0.0), 'or inf for steps'),
+    (lambda x: hmsa.Actuator(slew_limit=0.0), 'above 0 T/s, or inf'),
     (lambda x: hmsa.Actuator.from_yaml(5), 'path is 5: expected the path'),
     (lambda x: hmsa.Actuator.from_yaml('nothing.yaml'), 'cannot be read'),
     (lambda x: x.replace(stiffness=1.0), 'stiffness is no parameter'),

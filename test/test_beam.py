@@ -117,7 +117,7 @@ def test_parameters_of_a_beam_give_the_same_beam_and_modulus_and_geometry_scale_
 
 
 @pytest.mark.parametrize(('changes', 'message'), [
-    ({'law.width': 0.0}, 'law.width is 0 m: expected more than 0'),
+    ({'law.width': 0.0}, 'law.width is 0 m: expected a finite number above 0'),
     ({'law.youngs_modulus': 0.0}, 'constants of law beam'),
     ({'actuator.half_thickness': 0.004}, '0.008 m thick: expected a thickness of at most 0.25')])
 def test_what_is_no_beam_is_refused_in_a_sentence(changes, message):

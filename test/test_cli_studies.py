@@ -68,7 +68,7 @@ def test_robustness_prints_a_table_and_names_its_files(run, tmp_path):
         '--order', 2, 4, '--out', 'new/folder')
     assert (status, err) == (0, '')
     for words in ('stretch 1 to 1.4', 'stretch 1 to 0.9', 'two-step', 'robust, order 2',
-                  'robust, order 4', 'ZV', 'within 10 %', 'without the',
+                  'robust, order 4', 'ZV', 'errors of up to 10 %', 'without the',
                   'ZV: linear, designed at the target'):
         assert words in out
     assert 'robust, order 3' not in out
@@ -163,9 +163,9 @@ def test_robustness_of_what_creeps_compares_all_shapers(run, tmp_path):
         'robustness', '--params-file', 'creep.yaml', '--move', '1:1.2', '--order', 2, '--json')
     assert (status, err) == (0, '')
     found = {x['shaper']: x for x in json.loads(out)['moves'][0]['shapers']}
-    assert set(found) == set(SHAPERS)
+    assert set(found) == set(SHAPERS) - {'modal'}
     # Impulses of a linear model, and what is to be robust rather than exact, leave more.
-    exact = set(SHAPERS) - {'step', 'zv', 'zvd', 'umzv', 'ei', 'minimax'}
+    exact = set(found) - {'step', 'zv', 'zvd', 'umzv', 'ei', 'minimax'}
     assert max(found[x]['residual'] for x in exact) < 1e-4
 
 
@@ -198,8 +198,8 @@ def test_robustness_takes_the_actuator_of_a_file_with_its_law_and_its_coil(
     (['--move', '1:1'], 'two stretches that differ'),
     (['--move', '1:9'], 'target stretch is 9'),
     (['--move', '1:nan'], 'target stretch is nan'),
-    (['--shapers', 'zvdd'], "'zvdd' is unknown"),
-    (['--shapers', ''], "'' is unknown"),
+    (['--shapers', 'zvdd'], "shaper is 'zvdd': expected one of"),
+    (['--shapers', ''], "shaper is '': expected one of"),
     (['--errors', '0'], 'expected numbers above 0'),
     (['--errors', '1'], 'to 0.9'),
     (['--errors', 'nan'], 'nan'),

@@ -216,7 +216,7 @@ def test_reasons_are_worded_in_the_units_given():
 
 
 @pytest.mark.parametrize(('arguments', 'reason'), [
-    ({'shaper': 'tow_step'}, "shaper 'tow_step' is unknown: expected one of two_step"),
+    ({'shaper': 'tow_step'}, "shaper is 'tow_step': expected one of two_step"),
     ({'short_spell': 'ignore'}, "short_spell is 'ignore': expected one of refuse, continue"),
     ({'frame': MoveRequest.of(PAPER, State(2.7))},
      'start stretch is 2.7: expected a stretch between'),

@@ -268,8 +268,8 @@ def test_bias_and_gain_are_those_of_the_sensor_alone():
 
 
 @pytest.mark.parametrize(('make', 'sentence'), [
-    (lambda: SensorErrors(stretch_noise=-1.0), 'stretch_noise is -1: expected at least 0'),
-    (lambda: SensorErrors(stretch_gain=0.0), 'stretch_gain is 0: expected a number above 0'),
+    (lambda: SensorErrors(stretch_noise=-1.0), 'stretch_noise is -1: expected'),
+    (lambda: SensorErrors(stretch_gain=0.0), 'stretch_gain is 0: expected'),
     (lambda: SensorErrors(stretch_bias=math.nan), 'stretch_bias is nan'),
     (lambda: Fallback(-1.0), 'timeout is -1 s'),
     (lambda: Fallback(safe_flux='full'), "'full': expected one of hold, zero, ramp"),

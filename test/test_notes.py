@@ -54,7 +54,7 @@ def test_bad_input_is_one_line_and_a_refusal_names_the_assumption(here, capsys):
     assert '; note: without --params-file the actuator is the example block' in err
     assert main([*COMMANDS['wave'], '--cycles', '0']) == 2
     assert capsys.readouterr().err == (
-        'hmsa: error: cycles is 0: expected a finite number of at least 1 and at most 1e+06\n')
+        'hmsa: error: cycles is 0: expected 1 to 1e+06\n')
 
 
 def test_a_section_for_another_node_is_not_used_and_said(here, capsys):

@@ -207,9 +207,9 @@ def test_a_law_of_many_constants_takes_no_room_for_each_row(monkeypatch):
 
 
 @pytest.mark.parametrize(('words', 'message'), [
-    (['--law', 'silk'], "law 'silk' is unknown"),
+    (['--law', 'silk'], "law is 'silk': expected one of"),
     (['--law', 'ogden'], 'law.mu has 0 values'),
-    (['--shaper', 'two'], "shaper 'two' is unknown"),
+    (['--shaper', 'two'], "shaper is 'two': expected one of"),
     (['--vary', 'mass=1'], "column 'mass' is unknown"),
     (['--vary', 'slew'], 'expected NAME=GRID'),
     (['--zeta', '1', '--vary', 'zeta=1'], 'each name once'),

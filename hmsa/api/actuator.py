@@ -26,7 +26,7 @@ from hmsa.api.arguments import (
 )
 from hmsa.api.doubts import unquestioned, warn
 from hmsa.api.mounting import facts, further_facts, with_mount
-from hmsa.errors import assume, BadInputError, excerpt, meant, UnusualWarning
+from hmsa.errors import assume, BadInputError, meant, UnusualWarning
 from hmsa.files import write_text, yaml_text
 from hmsa.interfaces.actuator import actuator_from, model_from, parameters_of
 from hmsa.interfaces.parameters import (
@@ -46,6 +46,7 @@ from hmsa.model.moves import Setpoint, State
 from hmsa.model.parameters import ActuatorParameters
 from hmsa.planning.scales import Scales, scales
 from hmsa.planning.sequence import plan_sequence
+from hmsa.planning.shapers import get_shaper
 from hmsa.planning.shapers.request import as_errors, ERRORS, MoveRequest, SmoothLimits
 from hmsa.planning.timeline import JointModel
 from hmsa.runs.parameters import read_parameter_file, values_of
@@ -259,8 +260,12 @@ class Actuator:
         ['modal', 'modal']
 
         """
+        if damping_ratio is None and damping_coefficient is None:
+            damping_ratio = 0.05
         with unquestioned():
-            made = cls(mount=mount, **_damping(damping_ratio, damping_coefficient), **{
+            made = cls(**{
+                'mount': mount, 'damping_ratio': damping_ratio,
+                'damping_coefficient': damping_coefficient,
                 'half_length': 0.5 * number(length, 'length', 'm'),
                 'half_thickness': 0.5 * number(thickness, 'thickness', 'm'), 'law': 'beam',
                 'constants': {'youngs_modulus': youngs_modulus, 'width': width}, **more})
@@ -574,14 +579,8 @@ class Actuator:
         """
         from hmsa.api.plan import Plan
 
-        if temperature is not None:
-            return self.at_temperature(temperature).plan(
-                setpoints, shaper, limits=limits, start=start, order=order, errors=errors,
-                periods=periods, max_rate=max_rate, period=period, short_spell=short_spell)
-        model = self.model
-        for name, word in (('shaper', shaper), ('short_spell', short_spell)):
-            if not isinstance(word, str):
-                raise BadInputError(f'{name} is {excerpt(word)}: expected a name')
+        actuator = self if temperature is None else self.at_temperature(temperature)
+        model, shape = actuator.model, get_shaper(shaper)
         stretches, durations = setpoints_of(setpoints, model.material.rest)
         order, rate = whole(order, 'order'), number(max_rate, 'max_rate', '1/s')
         if limits is not None:
@@ -597,12 +596,12 @@ class Actuator:
                 State(model.material.rest if start is None else number(start, 'start')),
                 limits=model.limits, units=model.units, order=order,
                 delivery=replace(model.delivery, period=grid_of(period) / unit),
-                errors=self._errors(shaper) if errors is None else as_errors(errors),
+                errors=actuator._errors(shaper) if errors is None else as_errors(errors),
                 pace=SmoothLimits(
                     number(periods, 'periods'), unit * (rate if rate == math.inf else number(
                     rate, 'max_rate', '1/s', above=0.0)))),
-            shaper, short_spell)
-        return Plan(self, segments, shaper)
+            shape, short_spell)
+        return Plan(actuator, segments, shaper)
 
     @suggesting
     def follow(
@@ -860,13 +859,6 @@ class Actuator:
         write_text(file_of(path), '\n'.join([
             '/**:', '  ros__parameters:',
             *(f'    {x}: {yaml_text(y)}' for x, y in self.parameters.items())]) + '\n')
-
-
-def _damping(ratio: float | None, coefficient: float | None) -> dict[str, Any]:
-    """Return the damping of a beam, by default a ratio of 0.05."""
-    if ratio is None and coefficient is None:
-        ratio = 0.05
-    return {'damping_ratio': ratio, 'damping_coefficient': coefficient}
 
 
 _KEYS = tuple(x for x in Actuator.__init__.__annotations__ if x != 'return')

@@ -11,7 +11,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
-from hmsa.errors import BadInputError, excerpt, meant
+from hmsa.errors import BadInputError, check_choice, check_number, excerpt, meant
 from hmsa.interfaces.parameters import (
     ACTUATOR,
     BULK_RATIO,
@@ -149,8 +149,7 @@ def setpoints_of(value: Any, rest: float) -> tuple[Array, Array]:
     stretches, durations = columns_of(value, ('stretch', 'duration'), 'setpoints')
     for stretch, duration in zip(stretches.tolist(), durations.tolist(), strict=True):
         check_target(stretch, rest)
-        if not duration > 0.0:
-            raise BadInputError(f'duration is {duration:g} s: expected a number greater than 0')
+        check_number('duration', duration, 's', above=0.0, endless=True)
     if np.any(np.isinf(durations[:-1])):
         raise BadInputError('duration is inf s: only that of the last setpoint may be')
     return stretches, durations
@@ -244,7 +243,6 @@ def number(
         If the value is no number or out of range, or not finite although it has a lower bound.
 
     """
-    units = f' {unit}' if unit else ''
     value = plain(value, unit, what)
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, Real):
         raise BadInputError(
@@ -253,12 +251,8 @@ def number(
         found = float(value)
     except OverflowError:
         found = math.inf
-    bounded = least > -math.inf or above > -math.inf
-    if bounded and not (least <= found and above < found <= most and found < math.inf):
-        raise BadInputError(
-            f'{what} is {found:g}{units}: expected a finite number '
-            + (f'of at least {least:g}' if least > -math.inf else f'above {above:g}')
-            + (f' and at most {most:g}' if most < math.inf else '') + units)
+    if least > -math.inf or above > -math.inf:
+        check_number(what, found, unit, least=least, above=above, most=most)
     return found
 
 
@@ -296,18 +290,14 @@ def parameters_in(given: Mapping[str, Any], law: str = 'gent') -> dict[str, Any]
             given['flux_density_limits'])
     if 'slew_limit' in given:
         slew = number(given['slew_limit'], 'slew_limit', 'T/s')
-        if not slew > 0.0:
-            raise BadInputError(
-                f'slew_limit is {slew:g} T/s: expected more than 0, or inf for steps')
+        check_number('slew_limit', slew, 'T/s', above=0.0, endless=True)
         values['slew_limit'] = 0.0 if math.isinf(slew) else slew
     return values
 
 
 def _law_values(name: Any, constants: Any, modulus_given: bool) -> dict[str, Any]:
     """Return the parameters of a model; a number is accepted for a constant that is a list."""
-    if not isinstance(name, str) or name not in LAWS:
-        raise BadInputError(f'law is {excerpt(name)}: expected one of {", ".join(LAWS)}'
-                            + meant(name, LAWS))
+    check_choice('law', name, LAWS)
     law = LAWS[name]
     constants = mapping_of(constants, 'constants', "'mu': 5e3")
     names = {x.name.partition('.')[2]: x for x in law.constants}

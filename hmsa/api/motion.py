@@ -9,7 +9,7 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 
 from hmsa.api.arguments import file_of, number, several, suggesting, whole
-from hmsa.errors import BadInputError, excerpt, meant
+from hmsa.errors import BadInputError, check_choice, excerpt, meant
 from hmsa.interfaces.outcome import Outcome
 from hmsa.model.equations import Array
 from hmsa.model.simulation import longest_motion, response
@@ -353,9 +353,7 @@ def _draw_into(ax: Any, motion: Motion, panel: Any, line: Mapping[str, Any]) -> 
         'phase': (position, axis(f'{what.name} rate', rf'\dot{{{what.tex}}}', '1/s'))}
     if not isinstance(ax, Axes):
         raise BadInputError(f'ax is {excerpt(ax)}: expected axes of Matplotlib')
-    if not isinstance(panel, str) or panel not in panels:
-        raise BadInputError(f'panel is {excerpt(panel)}: expected one of {", ".join(panels)}'
-                            + meant(panel, panels))
+    check_choice('panel', panel, panels)
     line = {'label': motion.run.label, **line}
     try:
         if panel == 'command':

@@ -32,7 +32,7 @@ from hmsa.bag.metadata import BagTopic, find_files
 from hmsa.bag.output import EXPERIMENT
 from hmsa.bag.records import AnyCursor, merge, Message, MessageBlock
 from hmsa.bag.scan import ReadLimits, ScannedFile
-from hmsa.errors import BadInputError, BagError, HmsaError
+from hmsa.errors import BadInputError, BagError, check_number, HmsaError
 
 __all__ = ['BagReader', 'DecodedMessage', 'Message', 'BagTopic', 'read_messages']
 # Later than any log time.
@@ -88,9 +88,7 @@ class BagReader:
     def __init__(
             self, path: str | os.PathLike[str], *,
             max_chunk_size: int = limits.CHUNK_SIZE) -> None:
-        if max_chunk_size < 1:
-            raise BadInputError(
-                f'largest chunk is {max_chunk_size} bytes: expected at least 1')
+        check_number('largest chunk in bytes', max_chunk_size, least=1)
         self.path = Path(path)
         self._max_chunk_size = max_chunk_size
         intake = ReadLimits(max_chunk_size)

@@ -24,7 +24,7 @@ from hmsa.bag.metadata import BagTopic
 from hmsa.bag.output import Entry, OutputFile, PRESETS
 from hmsa.bag.reader import BagReader, topic_number
 from hmsa.bag.records import MESSAGE_HEAD
-from hmsa.errors import BadInputError, BagError
+from hmsa.errors import BadInputError, BagError, check_choice, check_number
 
 __all__ = ['BagWriter', 'MIN_FILE_SIZE', 'parse_custom_data', 'PRESETS', 'BagTopic']
 # Total size up to which changes of the custom data are written to a file at once. Later ones, of a
@@ -80,11 +80,8 @@ class BagWriter:
             self, folder: str | os.PathLike[str], *, preset: str = 'none',
             chunk_size: int = 768 * 1024, custom_data: Mapping[str, str] | None = None,
             ros_distro: str = 'jazzy', fsync: bool = False) -> None:
-        if preset not in PRESETS:
-            raise BadInputError(
-                f'storage preset is {preset!r}: expected one of {", ".join(PRESETS)}')
-        if chunk_size < 1:
-            raise BadInputError(f'chunk size is {chunk_size}: expected at least 1 byte')
+        check_choice('storage preset', preset, PRESETS)
+        check_number('chunk size in bytes', chunk_size, least=1)
         self.folder = Path(folder)
         # Metadata and messages are UTF-8; the name of a folder can be any bytes.
         self._stem = re.sub('[\ud800-\udfff]', '_', self.folder.name)

@@ -19,7 +19,7 @@ from hmsa.bag.metadata import BagTopic
 from hmsa.bag.output import Entry
 from hmsa.bag.reader import topic_number
 from hmsa.bag.writer import BagWriter, MIN_FILE_SIZE
-from hmsa.errors import BadInputError, BagError
+from hmsa.errors import BadInputError, BagError, check_number
 
 # Memory of a queued message in bytes, in addition to its payload.
 MESSAGE_OVERHEAD = 250
@@ -50,16 +50,14 @@ class RecordingLimits:
     snapshot_ns: int = 0  #: above 0: messages are kept this long, and written by a snapshot only
 
     def __post_init__(self) -> None:
-        if not self.flush_period > 0.0:
-            raise BadInputError(f'flush period is {self.flush_period} s: expected above 0')
+        check_number('flush period', self.flush_period, 's', above=0.0, endless=True)
         if self.max_size and self.max_size < MIN_FILE_SIZE:
             raise BadInputError(
                 f'largest file size is {self.max_size} bytes: expected 0 for no limit, or at '
                 f'least {MIN_FILE_SIZE}')
         if self.max_duration_ns < 0 or self.snapshot_ns < 0:
             raise BadInputError('a duration is negative: expected at least 0')
-        if self.cache_size < 1:
-            raise BadInputError(f'cache size is {self.cache_size}: expected at least 1 byte')
+        check_number('cache size in bytes', self.cache_size, least=1)
 
 
 class Status(NamedTuple):

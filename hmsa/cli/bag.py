@@ -8,7 +8,6 @@ example: hmsa bag info hmsa_demo/run
 
 import argparse
 from dataclasses import asdict
-import math
 from pathlib import Path
 import sys
 from typing import Any
@@ -16,7 +15,7 @@ from typing import Any
 from hmsa.bag.limits import CHUNK_SIZE, MEBIBYTE
 from hmsa.cli.options import add_command, JSON, show
 from hmsa.cli.terminal import progress, under_way
-from hmsa.errors import BadInputError, printable
+from hmsa.errors import check_number, printable
 
 _LARGEST_CHUNK = 65536
 
@@ -49,10 +48,7 @@ def add_parser(subparsers: Any) -> None:
 def _chunk_size(arguments: argparse.Namespace) -> int:
     """Return the size in bytes of the largest chunk to read."""
     most: float = arguments.max_chunk
-    if not 0.0 < most <= _LARGEST_CHUNK:
-        raise BadInputError(
-            f'largest chunk is {most:g} MiB: expected more than 0 and at most '
-            f'{_LARGEST_CHUNK} MiB')
+    check_number('largest chunk', most, 'MiB', above=0.0, most=_LARGEST_CHUNK)
     return max(1, round(most * MEBIBYTE))
 
 
@@ -93,9 +89,7 @@ def _verify(arguments: argparse.Namespace) -> int:
     from hmsa.runs.parameters import read_parameter_file
     from hmsa.runs.verify import verify_run
 
-    if not 0.0 <= arguments.tolerance < math.inf:
-        raise BadInputError(
-            f'tolerance is {arguments.tolerance:g}: expected a finite number of at least 0')
+    check_number('tolerance', arguments.tolerance, least=0.0)
     parameters = read_parameter_file(arguments.params_file) if arguments.params_file else None
     with progress('verifying'):
         runs = read_runs(

@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING, TypeVar
 
-from hmsa.errors import assume, BadInputError, excerpt, meant
+from hmsa.errors import assume, BadInputError, check_choice, check_number, excerpt
 
 if TYPE_CHECKING:
     from hmsa.api.actuator import Actuator
@@ -45,9 +45,7 @@ def law_of(text: str) -> tuple[str, dict[str, Any]]:
     from hmsa.model.laws import LAWS
 
     name, _, rest = text.partition(':')
-    if name not in LAWS:
-        raise BadInputError(
-            f'--law is {excerpt(name)}: expected one of {", ".join(LAWS)}' + meant(name, LAWS))
+    check_choice('--law', name, LAWS)
     known = {x.name.partition('.')[2]: x for x in LAWS[name].constants}
     constants: dict[str, Any] = {}
     for part in filter(None, rest.split(',')):
@@ -139,8 +137,7 @@ def assume_example() -> None:
 def timeout_of(arguments: argparse.Namespace) -> float:
     """Return the time limit in s; raise `BadInputError` if invalid."""
     timeout: float = arguments.timeout
-    if not timeout > 0.0:
-        raise BadInputError(f'timeout is {timeout:g}: expected a number of seconds above 0')
+    check_number('timeout', timeout, 's', above=0.0, endless=True)
     return timeout
 
 

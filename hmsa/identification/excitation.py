@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hmsa.errors import BadInputError
+from hmsa.errors import BadInputError, check_number
 from hmsa.identification import quantities
 from hmsa.identification.measurement import FEWEST, UncheckedMeasurement
 from hmsa.identification.response import respond, Response
@@ -80,9 +80,7 @@ class Bounds:
             raise BadInputError(
                 f'flux densities from {self.flux_density_min:g} to {self.flux_density_max:g} T: '
                 'expected a range with 0 T in it')
-        if not self.slew_limit > 0.0:
-            raise BadInputError(
-                f'slew limit is {self.slew_limit:g} T/s: expected a number above 0')
+        check_number('slew limit', self.slew_limit, 'T/s', above=0.0, endless=True)
 
     @classmethod
     def of(

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from hmsa.errors import BadInputError
+from hmsa.errors import BadInputError, check_number
 from hmsa.identification import diagnosis, quantities
 from hmsa.identification.defects import dead_band, GAIN
 from hmsa.identification.fit import Fit, fit, loss, robust_scale
@@ -254,10 +254,7 @@ def _check_uncertain(uncertain: Mapping[str, float], free: Sequence[str]) -> Non
         if name in free:
             raise BadInputError(
                 f'{name} is free and known to a standard deviation: expected one of the two')
-        if not 0.0 <= std < math.inf:
-            raise BadInputError(
-                f'the standard deviation of {name} is {std:g}: expected a finite number of at '
-                'least 0')
+        check_number(f'the standard deviation of {name}', std, least=0.0)
 
 
 def _with_errors_of_stamps(best: Fit) -> tuple[Fit, Array]:

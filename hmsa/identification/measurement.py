@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from hmsa.errors import BadInputError
+from hmsa.errors import BadInputError, check_number
 from hmsa.model.delivery import ramps
 from hmsa.model.equations import Array
 from hmsa.model.laws.coordinate import Coordinate, STRETCH
@@ -100,9 +100,7 @@ class Measurement:
                 raise BadInputError(
                     f'{one} of {self.label} goes from {times[place - 1]:.9g} to '
                     f'{times[place]:.9g} s: expected increasing times')
-        if not self.slew_limit > 0.0:
-            raise BadInputError(
-                f'slew limit is {self.slew_limit:g} T/s: expected a number above 0')
+        check_number('slew limit', self.slew_limit, 'T/s', above=0.0, endless=True)
         if not 0.0 <= self.earlier < math.inf:
             raise BadInputError(
                 f'levels may have switched {self.earlier:g} s earlier: expected a finite time of '

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from hmsa.errors import BadInputError, meant
+from hmsa.errors import BadInputError, check_number, meant
 from hmsa.model.compressible import BULK_RATIOS, condensed
 from hmsa.model.creep import Creep
 from hmsa.model.equations import Array
@@ -266,9 +266,7 @@ def values_of(
         half_thickness=others.get('half_thickness', actuator.half_thickness))
     for name, value in others.items():
         quantity = quantity_of(name)
-        if not (quantity.least <= value <= quantity.most and math.isfinite(value)):
-            raise BadInputError(
-                f'{name} is {value:g}: expected a finite number of at least {quantity.least:g}')
+        check_number(name, value, least=quantity.least, most=quantity.most)
     return {name: x.default for name, x in QUANTITIES.items()} | actuator.numbers | {
         'time_unit': actuator.time_unit, 'law': actuator.law, 'initial_stretch': actuator.rest,
         'bulk_ratio': actuator.bulk_ratio, _EXPONENT: actuator.transverse_mass_exponent,

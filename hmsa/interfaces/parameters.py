@@ -12,7 +12,7 @@ import math
 import re
 from typing import Any
 
-from hmsa.errors import BadInputError, excerpt, meant
+from hmsa.errors import BadInputError, check_choice, excerpt
 from hmsa.model.flows import CONSTANTS, FLOWS
 from hmsa.model.laws import LAWS
 from hmsa.model.thermal import COLDEST, HOTTEST, Thermal
@@ -123,10 +123,8 @@ class ParameterSpec:
         if isinstance(value, float) and not (math.isfinite(value) or value == self.maximum):
             raise BadInputError(
                 f'parameter {self.name} is {value}: expected a finite number')
-        if self.choices and value not in self.choices:
-            raise BadInputError(
-                f'parameter {self.name} is {excerpt(value)}: expected one of '
-                + ', '.join(self.choices) + meant(value, self.choices))
+        if self.choices:
+            check_choice(f'parameter {self.name}', value, self.choices)
         if isinstance(value, (int, float)) and not (
                 (self.minimum is None or value >= self.minimum)
                 and (self.maximum is None or value <= self.maximum)):

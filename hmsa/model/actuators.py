@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmsa import motion
-from hmsa.errors import BadInputError
+from hmsa.errors import BadInputError, check_number
 from hmsa.model import law
 from hmsa.model.equations import Array, stretch_limits
 from hmsa.model.parameters import ActuatorParameters, NondimensionalParameters
@@ -58,13 +58,8 @@ class Setup:
     def __post_init__(self) -> None:
         """Check the values."""
         self.actuator.nondimensional.check(self.stretch, 'initial stretch')
-        if not self.slew_limit > 0.0:
-            raise BadInputError(
-                f'slew limit is {self.slew_limit:g} T/s: expected a number above 0')
-        if not 0.0 <= self.coil_time_constant < math.inf:
-            raise BadInputError(
-                f'time constant of the coil is {self.coil_time_constant:g} s: expected a '
-                'finite number of at least 0')
+        check_number('slew limit', self.slew_limit, 'T/s', above=0.0, endless=True)
+        check_number('time constant of the coil', self.coil_time_constant, 's', least=0.0)
 
     def at_temperature(self, temperature: float) -> 'Setup':
         """Return it at a temperature in degrees Celsius, unchanged without coefficients."""
@@ -234,8 +229,7 @@ class Actuators:
         default the present flux density. Raise `BadInputError` if the state is out of range.
         """
         self.setups[i].actuator.nondimensional.check(stretch)
-        if not math.isfinite(rate):
-            raise BadInputError(f'stretch rate is {rate:g} 1/s: expected a finite number')
+        check_number('stretch rate', rate, '1/s')
         level = flux_density if level is None else level
         self._state[i] = stretch, rate * self._time_units[i], 0.0
         if len(self._branches):

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
-from hmsa.errors import BadInputError
+from hmsa.errors import BadInputError, check_number
 from hmsa.model.law import (
     boundary,
     ENERGY,
@@ -73,9 +73,7 @@ def check(bulk_ratio: float, law: Elastic | None, exponent: float = 0.0) -> None
         what = 'a table, whose levels contain the change of volume' if law.family == TABLE else (
             'a beam, whose volume its bending does not change')
         raise BadInputError(f'bulk_ratio is {bulk_ratio:g} for {what}: expected inf')
-    if not abs(exponent) <= STEEPEST:
-        raise BadInputError(
-            f'transverse_mass_exponent is {exponent:g}: expected {-STEEPEST:g} to {STEEPEST:g}')
+    check_number('transverse_mass_exponent', exponent, least=-STEEPEST, most=STEEPEST)
 
 
 @lru_cache(maxsize=64)

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
-from hmsa.errors import BadInputError, excerpt, meant
+from hmsa.errors import BadInputError, check_choice
 from hmsa.model import compressible, law
 from hmsa.model.equations import Array
 from hmsa.model.laws import elastica
@@ -306,9 +306,7 @@ def _together(frequencies: Array, shares: Array) -> tuple[Array, Array]:
 
 def check_mount(mount: Any) -> None:
     """Raise `BadInputError` if a value is not in `MOUNTS`."""
-    if not isinstance(mount, str) or mount not in MOUNTS:
-        raise BadInputError(f'mount is {excerpt(mount)}: expected one of {", ".join(MOUNTS)}'
-            + meant(mount, MOUNTS))
+    check_choice('mount', mount, MOUNTS)
 
 
 @lru_cache(maxsize=64)

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 import math
 from typing import Any
 
-from hmsa.errors import BadInputError, excerpt
+from hmsa.errors import BadInputError, check_choice
 from hmsa.model.flows import FLOWS
 from hmsa.model.flows.record import Flow, FLOW_CONSTANTS, MAXWELL
 
@@ -32,9 +32,7 @@ class Creep:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        if self.flow not in FLOWS:
-            raise BadInputError(
-                f'viscoelastic.flow is {excerpt(self.flow)}: expected one of {", ".join(FLOWS)}')
+        check_choice('viscoelastic.flow', self.flow, FLOWS)
         named, constants = self._named, self.law.constants
         for one, other in (('ratio', 'time'), *((x.name, 'ratio') for x in constants)):
             if len(named[one]) != len(named[other]):

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 import math
 
-from hmsa.errors import BadInputError
+from hmsa.errors import check_number
 from hmsa.model.moves import Level
 
 # Time constants after which a lag has settled.
@@ -31,13 +31,9 @@ class Delivery:
     def __post_init__(self) -> None:
         """Check the values."""
         for name, value in (('command period', self.period), ('coil time constant', self.lag)):
-            if not 0.0 <= value < math.inf:
-                raise BadInputError(
-                    f'{name} is {value:g}: expected a finite number of at least 0')
-        if not self.slew > 0.0:
-            raise BadInputError(f'slew limit is {self.slew:g}: expected a number above 0')
-        if not 0.0 < self.ripple <= 1.0:
-            raise BadInputError(f'creep tolerance is {self.ripple:g}: expected above 0 to 1')
+            check_number(name, value, least=0.0)
+        check_number('slew limit', self.slew, above=0.0, endless=True)
+        check_number('creep tolerance', self.ripple, above=0.0, most=1.0)
 
     @property
     def ideal(self) -> bool:

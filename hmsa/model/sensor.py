@@ -3,12 +3,11 @@
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-import math
 from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
-from hmsa.errors import BadInputError
+from hmsa.errors import check_number
 from hmsa.model.equations import Array
 
 T = TypeVar('T')
@@ -35,8 +34,7 @@ class Delay(Generic[T]):
     """
 
     def __init__(self, delay: int) -> None:
-        if delay < 0:
-            raise BadInputError(f'delay is {delay} ns: expected at least 0')
+        check_number('delay', delay, 'ns', least=0)
         self.delay = delay
         self._moving: deque[tuple[int, T]] = deque()
 
@@ -82,14 +80,9 @@ class SensorErrors:
 
     def __post_init__(self) -> None:
         for name in ('stretch_noise', 'rate_noise'):
-            if not 0.0 <= getattr(self, name) < math.inf:
-                raise BadInputError(f'{name} is {getattr(self, name):g}: expected at least 0')
-        if not math.isfinite(self.stretch_bias):
-            raise BadInputError(
-                f'stretch_bias is {self.stretch_bias:g}: expected a finite number')
-        if not 0.0 < self.stretch_gain < math.inf:
-            raise BadInputError(
-                f'stretch_gain is {self.stretch_gain:g}: expected a number above 0')
+            check_number(name, getattr(self, name), least=0.0)
+        check_number('stretch_bias', self.stretch_bias)
+        check_number('stretch_gain', self.stretch_gain, above=0.0)
 
 
 class Sensor:

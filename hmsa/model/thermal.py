@@ -3,7 +3,7 @@
 from dataclasses import dataclass, fields, replace
 import math
 
-from hmsa.errors import BadInputError
+from hmsa.errors import BadInputError, check_number
 
 #: Temperatures in degrees Celsius that a silicone bears; others are mistakes.
 COLDEST, HOTTEST = -60.0, 200.0
@@ -59,13 +59,8 @@ class Thermal:
                 raise BadInputError(
                     f'thermal.{name} is {value:g} 1/K: expected a coefficient of {-_STEEPEST:g} '
                     f'to {_STEEPEST:g} 1/K, such as 0.003 for 0.3 %/K')
-        if not 0.0 <= self.rise < math.inf:
-            raise BadInputError(
-                f'thermal.rise is {self.rise:g} K/T^2: expected a finite number of at least 0')
-        if not 0.0 < self.time_constant < math.inf:
-            raise BadInputError(
-                f'thermal.time_constant is {self.time_constant:g} s: expected a finite number '
-                'above 0')
+        check_number('thermal.rise', self.rise, 'K/T^2', least=0.0)
+        check_number('thermal.time_constant', self.time_constant, 's', above=0.0)
 
     def __bool__(self) -> bool:
         """Return whether the temperature changes anything."""

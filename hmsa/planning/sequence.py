@@ -14,7 +14,7 @@ import math
 import numpy as np
 
 from hmsa import motion
-from hmsa.errors import BadInputError, excerpt, HmsaError
+from hmsa.errors import check_choice, HmsaError
 from hmsa.model import law
 from hmsa.model.delivery import Delivery, ramps
 from hmsa.model.equations import Array, elastic_force, natural_frequency
@@ -192,17 +192,10 @@ def plan_sequence(
     """
     if not setpoints:
         raise RefusedError(Code.BAD_INPUT, 'no setpoint given: expected at least one')
-    check_short_spell(short_spell)
+    check_choice('short_spell', short_spell, SHORT_SPELL)
     begin = frame if isinstance(frame, MoveRequest) else MoveRequest.of(frame)
     shape = get_shaper(shaper) if isinstance(shaper, str) else shaper
     return tuple(segments(begin, setpoints, shape, short_spell))
-
-
-def check_short_spell(value: str) -> None:
-    """Raise `BadInputError` if the value is not in `SHORT_SPELL`."""
-    if value not in SHORT_SPELL:
-        raise BadInputError(
-            f'short_spell is {excerpt(value)}: expected one of {", ".join(SHORT_SPELL)}')
 
 
 def segments(

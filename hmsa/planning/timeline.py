@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from hmsa.errors import BadInputError
+from hmsa.errors import check_choice, check_number
 from hmsa.model import law
 from hmsa.model.delivery import Delivery, IDEAL
 from hmsa.model.equations import acceleration
@@ -26,7 +26,7 @@ from hmsa.model.simulation import follow, longest_motion, observed, sampled
 from hmsa.model.status import Code
 from hmsa.model.units import NANOSECONDS, Units
 from hmsa.planning.path import Path
-from hmsa.planning.sequence import check_short_spell, Remaining
+from hmsa.planning.sequence import Remaining, SHORT_SPELL
 from hmsa.planning.shapers import creeping, get_shaper
 from hmsa.planning.shapers.request import as_errors, ERRORS, PACE, SmoothLimits
 
@@ -82,10 +82,8 @@ class JointModel:
         actuator, options = self.actuator, self.options
         get_shaper(options.shaper)
         as_errors(options.errors)
-        check_short_spell(options.short_spell)
-        if options.lead_time < 0:
-            raise BadInputError(
-                f'lead_time is {options.lead_time / NANOSECONDS:g} s: expected at least 0 s')
+        check_choice('short_spell', options.short_spell, SHORT_SPELL)
+        check_number('lead_time', options.lead_time / NANOSECONDS, 's', least=0.0)
         units, pull = actuator.units, options.constant_force * actuator.load_per_newton
         time, load = units.time, units.load
         least, largest = map(units.of_level, (options.flux_density_min, options.flux_density_max))

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from hmsa.errors import BadInputError, excerpt, meant
+from hmsa.errors import BadInputError, check_choice, check_number
 
 #: Formats of figures; ``pgf`` is for LaTeX.
 KINDS = ('png', 'pdf', 'svg', 'pgf')
@@ -40,19 +40,13 @@ class Paper:
 
     def __post_init__(self) -> None:
         for name, value, unit, least, most in (
-                ('width', self.width, ' mm', 40.0, 400.0),
-                ('height', 100.0 if self.height is None else self.height, ' mm', 20.0, 400.0),
-                ('font size', self.letters, ' pt', 4.0, 24.0),
+                ('width', self.width, 'mm', 40.0, 400.0),
+                ('height', 100.0 if self.height is None else self.height, 'mm', 20.0, 400.0),
+                ('font size', self.letters, 'pt', 4.0, 24.0),
                 ('dpi', self.dpi, '', 50.0, 1200.0)):
-            if not least <= value <= most:
-                raise BadInputError(
-                    f'the {name} of a picture is {value:g}{unit}: expected {least:g} to '
-                    f'{most:g}{unit}')
-        for name in self.panels:
-            if name not in PANELS:
-                raise BadInputError(
-                    f'the panel {excerpt(name)} is unknown: expected some of '
-                    f'{", ".join(PANELS)}' + meant(name, PANELS))
+            check_number(f'the {name} of a picture', value, unit, least=least, most=most)
+        for panel in self.panels:
+            check_choice('a panel', panel, PANELS)
 
     @property
     def inches(self) -> float:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from hmsa.errors import BadInputError
+from hmsa.errors import check_number
 from hmsa.identification.fit import robust_scale
 from hmsa.identification.quantities import (
     actuator_of,
@@ -80,9 +80,7 @@ class EstimatorOptions:
 
     def __post_init__(self) -> None:
         for name, least in (('window', 10), ('noise', 0.0), ('gate', 1.0)):
-            if not least <= getattr(self, name) < math.inf:
-                raise BadInputError(
-                    f'{name} is {getattr(self, name)}: expected at least {least:g}')
+            check_number(name, getattr(self, name), least=least)
 
 
 @dataclass(frozen=True, eq=False)

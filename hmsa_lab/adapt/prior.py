@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hmsa.errors import BadInputError
+from hmsa.errors import BadInputError, check_number
 from hmsa.identification.known import Known
 from hmsa.identification.quantities import (
     check_free,
@@ -142,9 +142,7 @@ class Prior:
                 deviation *= max(values[name], _LEAST_ZETA * actuator.damping_unit)
             elif name == 'chain_limit':
                 deviation *= max(1.0 / values[name], _LEAST_LIMIT)
-            if not 0.0 < deviation < math.inf:
-                raise BadInputError(
-                    f'the deviation of {name} is {deviation:g}: expected a number above 0')
+            check_number(f'the deviation of {name}', deviation, above=0.0)
             size.append(deviation)
         spread = size.copy()
         if steepest:

@@ -17,7 +17,7 @@ from typing import Any, cast, IO, NamedTuple
 
 import numpy as np
 
-from hmsa.errors import BadInputError
+from hmsa.errors import check_number
 from hmsa.model.equations import Array
 from hmsa.model.units import NANOSECONDS
 from hmsa_lab.bench.bench import Bench, matched, PhaseResults, SILENCE
@@ -122,10 +122,8 @@ class ConformanceTrial:
     def __init__(
             self, name: str, joint: str, settings: Mapping[str, Any], *, level: float,
             rate: float) -> None:
-        if not 0.0 < level < math.inf:
-            raise BadInputError(f'limit is {level:g} T: expected a number above 0')
-        if not 1.0 <= rate <= 1e4:
-            raise BadInputError(f'rate is {rate:g} Hz: expected 1 to 10,000')
+        check_number('limit', level, 'T', above=0.0)
+        check_number('rate', rate, 'Hz', least=1.0, most=1e4)
         self.name, self._joint, self._settings = name, joint, settings
         self._level, self._rate = level, rate
         self._checks: list[Check] = []

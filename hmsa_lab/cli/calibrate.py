@@ -17,7 +17,7 @@ from typing import Any, TYPE_CHECKING
 from hmsa.cli.options import add_command, assume_example, JSON, Row, show
 from hmsa.cli.pictures import paper_of, picture_options
 from hmsa.cli.terminal import progress, under_way
-from hmsa.errors import BadInputError, HmsaError
+from hmsa.errors import BadInputError, check_number, HmsaError
 from hmsa.files import check_targets, write_text, yaml_text
 from hmsa.interfaces.quantities import quantity_of
 from hmsa_lab.cli.check_driver import settings_of
@@ -282,10 +282,8 @@ def _checked(arguments: argparse.Namespace, least: int) -> str:
     """Check the options, with a minimum number of steps; return the name of the hardware."""
     if arguments.simulate is (arguments.source is not None):
         raise BadInputError('expected either MODULE:NAME of hardware or --simulate')
-    if arguments.steps < least:
-        raise BadInputError(f'--steps is {arguments.steps}: expected at least {least}')
-    if not 0.0 < arguments.limit < math.inf:
-        raise BadInputError(f'--limit is {arguments.limit:g} T: expected a number above 0')
+    check_number('--steps', arguments.steps, least=least)
+    check_number('--limit', arguments.limit, 'T', above=0.0)
     return f'{_SIMULATED}SimulatedBench' if arguments.simulate else str(arguments.source)
 
 
@@ -319,8 +317,7 @@ def _latency(arguments: argparse.Namespace) -> int:
     name = _checked(arguments, 2)
     paper = paper_of(arguments, arguments.out, sources=[arguments.params_file])
     if arguments.lag is not None:
-        if not 0.0 <= arguments.lag < 1.0:
-            raise BadInputError(f'--lag is {arguments.lag:g} s: expected 0 to 1 s')
+        check_number('--lag', arguments.lag, 's', least=0.0, most=1.0)
         if arguments.probe is not None or arguments.simulate:
             raise BadInputError(
                 '--lag is given with a probe, which measures it: expected one of both')
@@ -377,8 +374,7 @@ def _static(arguments: argparse.Namespace) -> int:
     """
     # A table needs six levels.
     paper, name = paper_of(arguments, *_files(arguments.out)), _checked(arguments, 3)
-    if not 0.1 <= arguments.settle < math.inf:
-        raise BadInputError(f'--settle is {arguments.settle:g} s: expected at least 0.1 s')
+    check_number('--settle', arguments.settle, 's', least=0.1)
     from hmsa_lab.bench.calibration import scale_at_rest, scale_by_gauge, statics
     from hmsa_lab.experiments.calibrating import hold_staircase
 

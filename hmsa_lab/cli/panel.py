@@ -16,7 +16,7 @@ from typing import Any
 from hmsa.cli.options import add_command, JOINTS, NAMESPACE, setpoint_of_joints
 from hmsa.cli.terminal import under_way
 from hmsa.ending import ENDING
-from hmsa.errors import BadInputError
+from hmsa.errors import BadInputError, check_number
 
 
 def add_parser(subparsers: Any) -> None:
@@ -38,8 +38,7 @@ def add_parser(subparsers: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Serve until the end is requested; raise `BadInputError` if an option is invalid."""
     span: float = arguments.span
-    if not 0.1 <= span <= 3600.0:
-        raise BadInputError(f'span is {span:g}: expected 0.1 to 3600')
+    check_number('span', span, 's', least=0.1, most=3600.0)
     try:
         import tornado  # noqa: F401
     except ImportError as error:

@@ -16,7 +16,7 @@ from typing import Any, TYPE_CHECKING
 from hmsa.cli.options import add_command
 from hmsa.cli.terminal import under_way
 from hmsa.ending import ENDING
-from hmsa.errors import BadInputError
+from hmsa.errors import check_number
 
 if TYPE_CHECKING:
     from hmsa_lab.watch.listener import Listener
@@ -41,8 +41,7 @@ def add_parser(subparsers: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Watch until the end is requested; raise `BadInputError` if an option is out of range."""
-    if not 0.0 <= arguments.timeout <= 1e6:
-        raise BadInputError(f'timeout is {arguments.timeout:g}: expected 0 to 1e+06')
+    check_number('timeout', arguments.timeout, 's', least=0.0, most=1e6)
 
     from hmsa_lab.watch.listener import Listener
 

@@ -23,7 +23,7 @@ from tornado.httpserver import HTTPServer
 from tornado.web import Application, HTTPError, RequestHandler
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
-from hmsa.errors import BadInputError
+from hmsa.errors import BadInputError, check_number
 
 _HERE = Path(__file__).parent
 _ADDRESS = '127.0.0.1'
@@ -71,8 +71,7 @@ class Server:
         for name in ('access', 'general'):
             # Refused requests are not logged.
             logging.getLogger(f'tornado.{name}').addHandler(logging.NullHandler())
-        if not 0 <= port <= 65535:
-            raise BadInputError(f'port is {port}: expected 0 to 65535')
+        check_number('port', port, least=0, most=65535)
         try:
             self._socket = socket.create_server((_ADDRESS, port))
         except OSError as error:

@@ -12,7 +12,6 @@ import argparse
 from dataclasses import asdict
 from functools import partial
 from importlib import import_module
-import math
 from pathlib import Path
 import sys
 from typing import Any, TYPE_CHECKING
@@ -20,7 +19,7 @@ from typing import Any, TYPE_CHECKING
 from hmsa.cli.options import add_command, assume_example, JOINTS, NAMESPACE, SEQUENCE, sequence_of
 from hmsa.cli.terminal import progress, show_notes, with_notes
 from hmsa.ending import ENDING
-from hmsa.errors import BadInputError
+from hmsa.errors import BadInputError, check_number
 from hmsa.files import json_text, write_text
 from hmsa_ros.cli.send import SLOW
 
@@ -66,9 +65,7 @@ def add_parser(subparsers: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run the experiment as often as requested; raise `BadInputError` for an invalid number."""
     tolerances = _tolerances(arguments)
-    if not 1 <= arguments.repeat <= _MOST_REPEATS:
-        raise BadInputError(
-            f'--repeat is {arguments.repeat}: expected 1 to {_MOST_REPEATS}')
+    check_number('--repeat', arguments.repeat, least=1, most=_MOST_REPEATS)
     from hmsa_ros.clients.processes import dated, stay_local
 
     folder = arguments.out or dated('hmsa_run')
@@ -167,8 +164,7 @@ def _tolerances(arguments: argparse.Namespace) -> 'Tolerances | None':
         raise BadInputError(
             f'--tolerance is given with --{given}: expected setpoints with it; for the '
             "end, the planner's arrival_tolerance and vibration_tolerance count")
-    if not 0.0 < tolerance < math.inf:
-        raise BadInputError(f'tolerance is {tolerance:g}: expected a fraction above 0')
+    check_number('tolerance', tolerance, above=0.0)
     return Tolerances(tolerance, tolerance, 0.0)
 
 

@@ -10,7 +10,7 @@ from datetime import datetime
 from pathlib import Path
 import signal
 
-from hmsa.errors import BadInputError
+from hmsa.errors import BadInputError, check_choice
 from hmsa.interfaces.parameters import number_of
 from hmsa.interfaces.topics import PLANT
 from hmsa.runs.parameters import entries_of
@@ -67,10 +67,8 @@ class LaunchFile:
                 raise BadInputError(
                     f'launch argument {argument.name} is missing: expected '
                     f'{argument.name}:=..., {argument.description}')
-            if argument.choices and value not in argument.choices:
-                raise BadInputError(
-                    f'launch argument {argument.name} is {value!r}: expected one of '
-                    + ', '.join(argument.choices))
+            if argument.choices:
+                check_choice(f'launch argument {argument.name}', value, argument.choices)
             values[argument.name] = value
         for name in ('params_file', 'rviz_config'):
             if values[name] and not Path(values[name]).is_file():

@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 import math
 
-from hmsa.errors import BadInputError
+from hmsa.errors import BadInputError, check_number
 from hmsa.model.schedule import CommandSchedule
 from hmsa.model.units import NANOSECONDS
 from hmsa_ros.device.hardware import Calls, Hardware, HardwareError, Instrument
@@ -44,11 +44,8 @@ class HardwareJoint:
     temperature_limit: float = math.inf
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.limit < math.inf:
-            raise BadInputError(f'limit is {self.limit:g} T: expected a number above 0')
-        if not self.temperature_limit > 0.0:
-            raise BadInputError(
-                f'temperature_limit is {self.temperature_limit:g}: expected a number above 0')
+        check_number('limit', self.limit, 'T', above=0.0)
+        check_number('temperature_limit', self.temperature_limit, above=0.0, endless=True)
 
 
 class Coil(GuardedJoint):

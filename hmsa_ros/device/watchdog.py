@@ -8,7 +8,7 @@ from enum import Enum
 import math
 from typing import NamedTuple, TypeVar
 
-from hmsa.errors import BadInputError
+from hmsa.errors import BadInputError, check_choice, check_number
 from hmsa.model.sensor import Sample
 from hmsa.model.units import NANOSECONDS
 
@@ -82,16 +82,10 @@ class Fallback:
     lateness_limit: float = math.inf  #: lateness in s above which a command is rejected, above 0
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.timeout < math.inf:
-            raise BadInputError(f'timeout is {self.timeout:g} s: expected at least 0')
-        if self.safe_flux not in SAFE_FLUX:
-            raise BadInputError(
-                f'safe flux is {self.safe_flux!r}: expected one of {", ".join(SAFE_FLUX)}')
-        if not 0.0 < self.ramp_rate < math.inf:
-            raise BadInputError(f'ramp rate is {self.ramp_rate:g} T/s: expected above 0')
-        if not self.lateness_limit > 0.0:
-            raise BadInputError(
-                f'lateness limit is {self.lateness_limit:g} s: expected above 0')
+        check_number('timeout', self.timeout, 's', least=0.0)
+        check_choice('safe flux', self.safe_flux, SAFE_FLUX)
+        check_number('ramp rate', self.ramp_rate, 'T/s', above=0.0)
+        check_number('lateness limit', self.lateness_limit, 's', above=0.0, endless=True)
 
 
 class GuardedJoint:

@@ -11,7 +11,7 @@ from geometry_msgs.msg import WrenchStamped
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import Temperature
 
-from hmsa.errors import BadInputError
+from hmsa.errors import BadInputError, check_number
 from hmsa.interfaces import parameters as shared
 from hmsa.interfaces import topics
 from hmsa.interfaces.actuator import planned_from, too_few_samples
@@ -132,8 +132,7 @@ def _joints_from(values: JointParameters) -> dict[str, SimulatedJoint]:
 def _from_wrench(message: WrenchStamped) -> tuple[int, float]:
     """Return timestamp in ns and force along the field in N of a disturbance."""
     force, torque = message.wrench.force, message.wrench.torque
-    if not math.isfinite(force.z):
-        raise BadInputError(f'force.z is {force.z:g} N: expected a finite number')
+    check_number('force.z', force.z, 'N')
     if any((force.x, force.y, torque.x, torque.y, torque.z)):
         raise BadInputError(
             'there is a force across the field, or a torque: expected force.z alone, since the '

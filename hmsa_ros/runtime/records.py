@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any, NamedTuple, TYPE_CHECKING
 
-from hmsa.errors import BadInputError, excerpt
+from hmsa.errors import check_number, excerpt
 from hmsa.interfaces.outcome import Outcome
 from hmsa.judge.records import Finding, GoalTolerances, Tolerances
 from hmsa.model.status import Code, RefusedError
@@ -56,8 +56,7 @@ class Settings:
     def __post_init__(self) -> None:
         for name in ('heartbeat_period', 'lateness_tolerance', 'takeover_timeout',
                      'takeover_max_age', 'temperature_max_age', 'max_points'):
-            if getattr(self, name) < 0:
-                raise BadInputError(f'{name} is {getattr(self, name)}: expected at least 0')
+            check_number(name, getattr(self, name), least=0)
 
     @property
     def adapts(self) -> bool:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from hmsa.cli.options import Row
 from hmsa.cli.terminal import under_way
-from hmsa.errors import BadInputError
+from hmsa.errors import BadInputError, check_number
 
 if TYPE_CHECKING:
     from hmsa_studies.schedulers import Start
@@ -30,8 +30,8 @@ def options(workers: str) -> tuple[Row, ...]:
 
 def asked(arguments: argparse.Namespace) -> list[str]:
     """Return the given chunk options; raise `BadInputError` if they exclude each other."""
-    if arguments.workers is not None and arguments.workers < 1:
-        raise BadInputError(f'--workers is {arguments.workers}: expected at least 1')
+    if arguments.workers is not None:
+        check_number('--workers', arguments.workers, least=1)
     if arguments.dask is not None and arguments.workers is not None and arguments.dask != 'local':
         raise BadInputError('--workers and --dask ADDRESS: expected one of them')
     return [f'--{x}' for x in ('shard', 'dask', 'resume') if getattr(arguments, x)]

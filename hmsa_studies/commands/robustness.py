@@ -22,7 +22,7 @@ from hmsa.cli.options import add_command, MATERIAL
 from hmsa.cli.pictures import formats_of, paper_of, picture_options
 from hmsa.cli.plan import nominal
 from hmsa.cli.terminal import progress
-from hmsa.errors import BadInputError
+from hmsa.errors import BadInputError, check_number
 from hmsa.files import json_text, make_folder
 from hmsa_studies.commands import chunked
 
@@ -269,8 +269,7 @@ def _feedback(arguments: argparse.Namespace, start: 'Start', in_chunks: bool) ->
     from hmsa_studies.schedulers import in_order
     from hmsa_studies.study_folder import StudyFolder
 
-    if arguments.seeds < 1:
-        raise BadInputError(f'--seeds is {arguments.seeds}: expected at least 1')
+    check_number('--seeds', arguments.seeds, least=1)
     matrix = Matrix(arguments.seeds)
     if arguments.params_file is not None:
         belief = read_belief(arguments.params_file)

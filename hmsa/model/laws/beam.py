@@ -11,7 +11,7 @@ stiffness 3 and inertia 1, as a block with c1 = 5; those of the elastica are 3 %
 from collections.abc import Mapping
 from typing import Any
 
-from hmsa.errors import BadInputError, excerpt
+from hmsa.errors import BadInputError, check_number, excerpt
 from hmsa.model.laws.record import (
     BEAM,
     Constant,
@@ -50,8 +50,7 @@ def _scaled(values: Mapping[str, Any]) -> tuple[float, Elastic]:
         raise BadInputError(
             f'the beam is {length:g} m long and {thickness:g} m thick: expected a thickness of at '
             f'most {_THICKEST:g} of the length (actuator.half_thickness, actuator.half_length)')
-    if not width > 0.0:
-        raise BadInputError(f'parameter law.width is {width:g} m: expected more than 0')
+    check_number('parameter law.width', width, 'm', above=0.0)
     modulus = positive_modulus(
         LAW.name, youngs * (bending.ROOT ** 2 * thickness / (12.0 * length)) ** 2,
         'E (0.293 h/l)^2', (f'{youngs:g} Pa', f'{width:g} m'))

@@ -8,7 +8,7 @@ A shaper takes a `MoveRequest` and returns a `Move`, whose first level is at tim
 
 import math
 
-from hmsa.errors import BadInputError, meant
+from hmsa.errors import check_choice
 from hmsa.planning.shapers.linear import ei, step, umzv, zv, zvd
 from hmsa.planning.shapers.minimax import minimax
 from hmsa.planning.shapers.minimum_time import minimum_time
@@ -33,9 +33,5 @@ SHAPERS: dict[str, Shaper] = {
 
 def get_shaper(name: str) -> Shaper:
     """Return a shaper by its name in `SHAPERS`; raise `BadInputError` for another name."""
-    try:
-        return SHAPERS[name]
-    except KeyError:
-        raise BadInputError(
-            f'shaper {name!r} is unknown: expected one of {", ".join(SHAPERS)}'
-            + meant(name, SHAPERS)) from None
+    check_choice('shaper', name, SHAPERS)
+    return SHAPERS[name]

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from hmsa.errors import BadInputError, excerpt
+from hmsa.errors import BadInputError, check_number, excerpt
 from hmsa.model import law
 from hmsa.model.delivery import Delivery, IDEAL
 from hmsa.model.equations import Array
@@ -51,12 +51,10 @@ class SmoothLimits:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        if not LEAST_PERIODS <= self.periods <= MOST_PERIODS:
-            raise BadInputError(
-                f'smooth_periods is {self.periods:g}: expected {LEAST_PERIODS:g} to '
-                f'{MOST_PERIODS:g} natural periods')
-        if not self.rate > 0.0:
-            raise BadInputError(f'stretch_rate_max is {self.rate:g}: expected a number above 0')
+        check_number(
+            'smooth_periods', self.periods, 'natural periods', least=LEAST_PERIODS,
+            most=MOST_PERIODS)
+        check_number('stretch_rate_max', self.rate, above=0.0, endless=True)
 
 
 #: One natural period, at any rate.

@@ -11,7 +11,7 @@ of n convolved ZV shapers.
 from dataclasses import replace
 import math
 
-from hmsa.errors import BadInputError
+from hmsa.errors import check_number
 from hmsa.model import law
 from hmsa.model.delivery import IDEAL
 from hmsa.model.moves import Level, Move, State
@@ -32,8 +32,7 @@ def robust(request: MoveRequest) -> Move:
     the two-step command, which is the chain of order 1. If there is no chain, the result is that
     of `two_step`. Raise `BadInputError` if the order is not 1 to `MOST_ORDER`.
     """
-    if not 1 <= request.order <= MOST_ORDER:
-        raise BadInputError(f'order is {request.order}: expected 1 to {MOST_ORDER}')
+    check_number('order', request.order, least=1, most=MOST_ORDER)
     move = two_step(request)
     if request.order == 1 or move.code is not Code.TWO_STEP:
         return move
