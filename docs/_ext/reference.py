@@ -35,6 +35,8 @@ from hmsa.plugins import NODES, registered
 
 LOGGER = logging.getLogger(__name__)
 PACKAGES = Path(errors.__file__).parent.parent
+# Functions that raise `BadInputError` about what they are told first.
+CHECKS = (errors.check_choice.__name__, errors.check_number.__name__)
 # Rules of numpydoc that the style of this project does not share: sections that not every
 # function needs (ES01, EX01, SA01), the empty line before the closing quotes (GL02, GL03),
 # parameters of one type described together (PR03), symbols that begin a description (PR08,
@@ -60,8 +62,13 @@ def messages(path: Path) -> Iterator[tuple[str, str, int]]:
     tree = ast.parse(path.read_text(encoding='utf-8'))
     for node in ast.walk(tree):
         # Raised here or returned for a caller to raise.
-        if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
-                and node.func.id in KINDS):
+        if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Name)):
+            continue
+        if node.func.id in CHECKS:
+            what = node.args[0]
+            name = placeholder(what) if isinstance(what, ast.Name) else sentence(what)
+            yield 'BadInputError', f'{name} is {{…}}: expected {{…}}', node.lineno
+        if node.func.id not in KINDS:
             continue
         texts = [text for text in map(sentence, node.args) if ' ' in text]
         if texts:
