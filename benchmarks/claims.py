@@ -1,5 +1,5 @@
 """
-Statements in the paper's text, computed: ``python -m hmsa_studies.claims``.
+Statements in the paper's text, computed: ``python -m benchmarks.claims``.
 
 Every printed line is part of docs/validation/paper-comparison.md, which explains it.
 """

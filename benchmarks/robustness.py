@@ -1,5 +1,5 @@
 """
-``python -m hmsa_studies``: robustness tables of the documentation, and their figures.
+``python -m benchmarks.robustness``: robustness tables of the documentation, and their figures.
 
 The script that draws all figures of the documentation (``make pictures``) draws these, too.
 """
@@ -11,6 +11,14 @@ import sys
 
 import numpy as np
 
+from benchmarks.damped_sampled import (
+    damped_study,
+    DampedStudy,
+    draw_damped,
+    draw_sampled,
+    LIMITS,
+    sampled_study,
+)
 from hmsa.errors import complain, HmsaError
 from hmsa.model.moves import State
 from hmsa.model.parameters import NondimensionalParameters
@@ -18,8 +26,8 @@ from hmsa.model.residual import percent
 from hmsa.planning.shapers import SHAPERS
 from hmsa.planning.shapers.request import MoveRequest, SmoothLimits
 from hmsa.report.paper import SCREEN
-from hmsa_studies.pictures import draw_damped, draw_front, draw_robustness, draw_sampled
-from hmsa_studies.residual import Actual, damped_study, DampedStudy, Errors, LIMITS, sampled_study
+from hmsa_studies.pictures import draw_front, draw_robustness
+from hmsa_studies.residual import Actual, Errors
 from hmsa_studies.robustness import Candidate, candidates, Case, PARAMETERS, Result, study
 from hmsa_studies.sweep import parse_grid, Sweep
 from hmsa_studies.sweep_pictures import draw_sweep

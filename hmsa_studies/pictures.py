@@ -1,35 +1,16 @@
-"""Figures of the studies: robustness, sampled hardware, heavy damping."""
+"""Figures of robustness."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 import math
 from pathlib import Path
-from typing import Any
 
 from matplotlib.axes import Axes
 import numpy as np
 
-from hmsa.model.equations import critical_zeta, elastic_force
-from hmsa.model.moves import Move, State
-from hmsa.model.parameters import NondimensionalParameters
 from hmsa.model.residual import percent
-from hmsa.planning.shapers.linear import step
-from hmsa.planning.shapers.minimum_time import minimum_time
-from hmsa.planning.shapers.request import MoveRequest
 from hmsa.report import looks, style
 from hmsa.report.looks import LineStyle
 from hmsa.report.paper import Paper
-from hmsa_studies.residual import (
-    Actual,
-    DampedStudy,
-    ideal_move,
-    LIMITS,
-    limits_of,
-    PROMISED,
-    rounded_move,
-    SampledStudy,
-    SETTLED,
-    solved_move,
-)
 from hmsa_studies.robustness import Candidate, Case, ORDERED, Result
 
 # Smaller residuals are drawn at this value.
@@ -39,8 +20,6 @@ _SYMBOLS = {'G': '$G$', 'zeta': r'$\zeta$', 'J_lim': r'$J_\mathrm{lim}$'}
 _ORDERS = (('full', 1.0), ('none', 0.7), ('left', 0.5), ('top', 0.5))
 # Number of markers on a curve.
 _MARKS = 5
-# Smaller fractions of a step are rounding of the search on a grid.
-_RESOLVED = 1e-8
 
 
 def draw_robustness(
@@ -190,122 +169,3 @@ def _bars(
     axes.xaxis.minorticks_off()
     axes.yaxis.minorticks_off()
     axes.grid(visible=False, axis='y')
-
-
-def draw_sampled(
-        path: Path, study: SampledStudy, paper: Paper | None = None, *,
-        period: float = 0.28) -> None:
-    """Draw residuals over the command period, and a run at one period (fraction of tau_p)."""
-    with style.picture(path, 3.9, paper) as figure:
-        figure.suptitle(
-            rf'Commands every period $T$, $\lambda$ = {study.start:g} to {study.target:g}, '
-            rf'$\zeta$ = {study.material.zeta:g}, $J_\mathrm{{lim}}$ = '
-            rf'{study.material.j_lim:g}, $c_1$ = {study.material.c1:g}')
-        panels = figure.subplot_mosaic(
-            [['residual', 'command'], ['residual', 'response']], height_ratios=[1.0, 1.3])
-        axes = panels['residual']
-        axes.plot(
-            study.periods, 100.0 * study.bound, label='rounded, worst case', color=looks.VERMILION,
-            linewidth=0.8, linestyle=(0, (1, 1)))
-        axes.plot(
-            study.periods, 100.0 * np.maximum(study.rounded, _RESOLVED),
-            label='switch rounded to the grid', **{**style.UNSHAPED, 'linestyle': '-'})
-        axes.plot(
-            study.periods, 100.0 * np.maximum(study.solved, _RESOLVED),
-            label='solved on the grid', **style.SHAPED)
-        style.note(axes, r'below $10^{-6}$ %: not resolved', (study.periods[0], 1e-6), (4, 3),
-                   **style.SOFT)
-        axes.axvline(PROMISED, color=looks.GREY, linewidth=0.8, linestyle=(0, (1, 1.5)))
-        style.note(axes, r'$\tau_p/3$', (PROMISED, 1e-4), (4, 0), **style.SOFT)
-        axes.set_xscale('log')
-        axes.set_yscale('log')
-        axes.set_ylim(5e-7, 300.0)
-        style.finish(axes, style.axis('command period', r'T/\tau_p'),
-                     style.axis('residual vibration', unit='% of step'), 'a')
-        ticks = [x for x in (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0) if x >= study.periods[0]]
-        axes.set_xticks(ticks, [f'{x:g}' for x in ticks])
-        axes.xaxis.minorticks_off()
-        axes.yaxis.minorticks_off()
-        axes.set_xlim(study.periods[0], max(1.0, study.periods[-1]))
-
-        size = period * study.tau_p
-        solved = solved_move(study.start, study.target, study.material, size)
-        rounded = rounded_move(ideal_move(study.start, study.target, study.material), size)
-        moves = [(rounded, {**style.UNSHAPED, 'linestyle': '-'})]
-        if solved is not None:
-            moves.append((solved, style.SHAPED))
-        end = 4.5 * study.tau_p
-        _draw_moves(panels, study, study.material, moves, end, 1200)
-        axes = panels['command']
-        for number in range(int(1.6 * study.tau_p / size) + 1):
-            axes.axvline(number * size, **style.TARGET)
-        axes.set_xlim(-0.1 * study.tau_p, 1.6 * study.tau_p)
-        style.finish(
-            axes, style.axis('time', r'\tau'), style.axis('load', r'\beta'), 'b')
-        axes.set_title(rf'$T$ = {period:g} $\tau_p$, grid dashed', loc='right', fontsize='small')
-        panels['response'].set_xlim(0.0, end)
-        figure.align_ylabels([panels['command'], panels['response']])
-        style.legend_below(figure, panels['residual'])
-
-
-def _draw_moves(
-        panels: Mapping[str, Axes], study: SampledStudy | DampedStudy,
-        material: NondimensionalParameters, moves: Sequence[tuple[Move, dict[str, Any]]],
-        end: float, count: int, unit: float = 1.0) -> None:
-    """Draw commands, their loads over a unit, and their responses, each in its look."""
-    times = np.linspace(0.0, end, count, dtype=np.float64)
-    for move, look in moves:
-        loads = [x.load / unit for x in move.levels]
-        panels['command'].step(
-            [*(x.time for x in move.levels), times[-1]], [*loads, loads[-1]], where='post', **look)
-        panels['response'].plot(
-            times, Actual.off(material).response(move, study.start, times), **look)
-    panels['response'].axhline(study.target, **style.TARGET)
-    style.finish(
-        panels['response'], style.axis('time', r'\tau'), style.axis('stretch', r'\lambda'), 'c')
-
-
-def draw_damped(
-        path: Path, study: DampedStudy, paper: Paper | None = None, *,
-        zeta: float = 4.0) -> None:
-    """Draw settling times over zeta, and commands and responses at one zeta."""
-    material = NondimensionalParameters(zeta)
-    holding = float(elastic_force(study.target, material))
-    kinds = (
-        looks.RECORDED.line(), {**looks.SHAPERS['minimum_time'].line(), 'zorder': 3})
-    names = [
-        rf'minimum time, ${least:g}\,\beta_1$ to ${most:g}\,\beta_1$' for least, most in LIMITS]
-    with style.picture(path, 3.9, paper) as figure:
-        figure.suptitle(
-            rf'Above critical damping ({float(critical_zeta(study.target, material)):.3f}), '
-            rf'$\lambda$ = {study.start:g} to {study.target:g}, $J_\mathrm{{lim}}$ = '
-            rf'{material.j_lim:g}, $c_1$ = {material.c1:g}')
-        panels = figure.subplot_mosaic(
-            [['times', 'command'], ['times', 'response']], height_ratios=[1.0, 1.3])
-        axes = panels['times']
-        axes.plot(study.zetas, study.step, label='unshaped step', **style.UNSHAPED)
-        for row, look in enumerate(kinds):
-            axes.plot(study.zetas, study.settled[row], **look, label=names[row])
-        axes.set_xlim(study.zetas[0], study.zetas[-1])
-        axes.set_ylim(0.0, None)
-        style.finish(
-            axes, style.axis('damping', r'\zeta'),
-            rf'time $\tau$ to within {100.0 * SETTLED:g} % of the step', 'a')
-
-        moves: list[tuple[Move, dict[str, Any]]] = [
-            (step(MoveRequest(State(study.start), study.target, material)), style.UNSHAPED)]
-        moves += [
-            (minimum_time(MoveRequest(
-                State(study.start), study.target, material,
-                limits_of(study.target, material, row))),
-             look)
-            for row, look in enumerate(kinds)]
-        end = float(np.interp(zeta, study.zetas, study.step)) * 1.1
-        _draw_moves(panels, study, material, moves, end, 800, holding)
-        axes = panels['command']
-        axes.set_xlim(-0.02 * end, end)
-        style.finish(axes, '', style.axis('load', r'\beta/\beta_1'), 'b')
-        axes.set_title(rf'$\zeta$ = {zeta:g}', loc='right', fontsize='small')
-        panels['response'].set_xlim(-0.02 * end, end)
-        figure.align_ylabels([panels['command'], panels['response']])
-        style.legend_below(figure, panels['times'])

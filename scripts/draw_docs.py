@@ -29,6 +29,8 @@ sys.path.insert(0, str(ROOT))
 
 from benchmarks.beam_segments import Chain  # noqa: E402
 from benchmarks.block_elements import Block  # noqa: E402
+from benchmarks.robustness import PICTURES as STUDIES  # noqa: E402
+from benchmarks.warming import SILICONE  # noqa: E402
 from hmsa import Actuator  # noqa: E402
 from hmsa.interfaces.actuator import actuator_from  # noqa: E402
 from hmsa.interfaces.outcome import Outcome  # noqa: E402
@@ -55,9 +57,7 @@ from hmsa.report.picture import draw  # noqa: E402
 from hmsa.runs.record import RecordedLevel, Run  # noqa: E402
 from hmsa.runs.setpoints import described  # noqa: E402
 from hmsa_ros.clients.demo import second_act, SEQUENCE  # noqa: E402
-from hmsa_studies.__main__ import PICTURES as STUDIES  # noqa: E402
 from hmsa_studies.paper import draw_figure, FIGURES  # noqa: E402
-from hmsa_studies.warming import SILICONE  # noqa: E402
 
 FOLDER = ROOT / 'docs' / 'images'
 STRETCH, TIME = style.axis('stretch', r'\lambda'), style.axis('time', r'\tau')

@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 from scipy.integrate import quad, solve_ivp
 
+from benchmarks import claims
 from hmsa.cli import main
 from hmsa.model.parameters import NondimensionalParameters
 from hmsa.planning.two_step import plan_two_step
 from hmsa.report.paper import SCREEN
-from hmsa_studies import claims, paper_data
+from hmsa_studies import paper_data
 from hmsa_studies.paper import FIGURES, write_figure
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -12,6 +12,15 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
+from benchmarks.damped_sampled import (
+    damped_study,
+    draw_damped,
+    draw_sampled,
+    ideal_move,
+    sampled_study,
+    settling_time,
+)
+from benchmarks.robustness import tables
 from hmsa.errors import BadInputError, HmsaError
 from hmsa.model.creep import Creep
 from hmsa.model.delivery import Delivery
@@ -26,18 +35,9 @@ from hmsa.model.parameters import ActuatorParameters, NondimensionalParameters, 
 from hmsa.model.residual import percent
 from hmsa.model.status import Code
 from hmsa.planning.two_step import plan_two_step
-from hmsa_studies.__main__ import tables
 from hmsa_studies.axes import MOST_VALUES, parse_grid, read_cases
-from hmsa_studies.pictures import draw_damped, draw_front, draw_robustness, draw_sampled
-from hmsa_studies.residual import (
-    Actual,
-    arrival_of,
-    damped_study,
-    Errors,
-    ideal_move,
-    sampled_study,
-    settling_time,
-)
+from hmsa_studies.pictures import draw_front, draw_robustness
+from hmsa_studies.residual import Actual, arrival_of, Errors
 from hmsa_studies.robustness import (
     Candidate,
     candidates,

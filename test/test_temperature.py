@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
+from benchmarks.warming import block, DURATION, TARGETS, WARMING, warming
 import hmsa
 from hmsa.cli import main
 from hmsa.errors import BadInputError, UnusualWarning
@@ -31,7 +32,6 @@ from hmsa_ros.runtime.records import (
     StretchRequest,
     Trajectory,
 )
-from hmsa_studies.warming import block, DURATION, TARGETS, WARMING, warming
 
 COEFFICIENTS = {'shear_modulus': 3e-3, 'remanence': -1e-3, 'damping_coefficient': -5e-3}
 THERMAL = Thermal(**COEFFICIENTS)

@@ -44,7 +44,7 @@ _BOUND, _DRIFT = 4.0, 0.003
 # The same where the temperature is estimated.
 _SLOWER = 0.1 * _DRIFT
 # Drift of the temperature in K in a second, deviation of a measured one, and duration in s at rest
-# in which it counts as constant (`hmsa_studies.warming`).
+# in which it counts as constant (benchmarks/warming.py).
 _WARMS, _MEASURED, _CONSTANT = 0.2, 0.3, 1.0
 # Fraction of this maximum above which an estimate is not trusted, except for uncertain parameters.
 _STRANGE, _FREELY = 0.98, ('damping_coefficient', 'viscoelastic_time')
