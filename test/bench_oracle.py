@@ -4,27 +4,15 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 import math
 
+from at_work import AtWork, MS, planner, START
 from identification_oracle import force_of
 import numpy as np
-from one_sample import sample
 from scipy.constants import mu_0
 from scipy.integrate import solve_ivp
 
 from hmsa.model.parameters import ActuatorParameters, paper_actuator
-from hmsa.planning.group import PlannerGroup
-from hmsa.planning.planner import Options, Planner
-from hmsa_ros.runtime.records import (
-    Environment,
-    EstimateChanged,
-    Send,
-    Settings,
-    StatusChanged,
-    StretchRequest,
-)
-from hmsa_ros.runtime.runtime import Runtime
+from hmsa_ros.runtime.records import EstimateChanged, Settings, StretchRequest
 
-MS = 1_000_000
-START = 1000 * MS
 # Integration ahead of the present time, in ns.
 _AHEAD = 200 * MS
 
@@ -95,30 +83,28 @@ class Plant:
             atol=1e-10, dense_output=True).sol
 
 
-class Bench:
+class Bench(AtWork):
     """A runtime, a plant and a sensor; `sense` returns samples (timestamp, stretch) of it."""
 
     def __init__(
             self, plant: Plant, nominal: ActuatorParameters, noise: float, *, lead: int = 2 * MS,
             delay: int = 2 * MS, seed: int = 0, limit: float = 0.5, report=True, **settings):
-        self.plant, self.now, self.noise, self.delay = plant, START, noise, delay
+        self.plant, self.noise, self.delay = plant, noise, delay
         self.random = np.random.default_rng(seed)
         self.sense: Callable = lambda time, stretch: [(time, stretch)]
         self.report = report
         self.effort: Callable = lambda: math.nan  # field in T reported by the device
         self.wire = []
-        self.estimates, self.sent, self.codes = [], [], []
-        self.runtime = Runtime(
-            PlannerGroup({'a': Planner(nominal, Options(
-                flux_density_min=-limit, flux_density_max=limit, lead_time=lead))}),
+        self.sent = []
+        super().__init__(
+            {'a': planner(
+                nominal, flux_density_min=-limit, flux_density_max=limit, lead_time=lead)},
             Settings(**{'takeover_timeout': 0, 'heartbeat_period': 0, 'feedback': 'adapt',
-                        **settings}),
-            Environment(clock=lambda: self.now, steady=lambda: self.now))
-        self.runtime.active = True
+                        **settings}), START)
 
     @property
-    def planner(self):
-        return self.runtime.group.planners['a']
+    def estimates(self):
+        return self.outputs_of(EstimateChanged)
 
     @property
     def message(self):
@@ -133,14 +119,9 @@ class Bench:
         """Advance in steps of 1 ms; return times in ns and true stretches."""
         seen, end = [], self.now + span
         while self.now < end:
-            for x in self.runtime.tick(self.now):
-                if isinstance(x, Send):
-                    self.sent.append((x.stamp, x.flux_density))
-                    self.plant.command(x.stamp, x.flux_density)
-                elif isinstance(x, EstimateChanged):
-                    self.estimates.append(x)
-                elif isinstance(x, StatusChanged):
-                    self.codes.append(x.verdict.code)
+            for x in self.tick():
+                self.sent.append((x.stamp, x.flux_density))
+                self.plant.command(x.stamp, x.flux_density)
             self.now += MS
             stretch, changes = self.plant.advance(self.now)
             seen.append((self.now, stretch))
@@ -151,9 +132,7 @@ class Bench:
             self.wire += [(self.now + self.delay, *x) for x in self.sense(self.now, noisy)]
             while self.wire and self.wire[0][0] <= self.now:
                 _, stamp, value = self.wire.pop(0)
-                if self.runtime.looks_at(stamp):
-                    self.runtime.observed('a', sample(
-                        stamp, value, flux_density=self.effort(), came=self.now))
+                self.show(stamp, value, flux_density=self.effort())
         return np.array(seen)
 
     def move(self, target, hold):

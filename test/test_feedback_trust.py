@@ -3,9 +3,9 @@
 from dataclasses import replace
 import math
 
+from at_work import sample
 from bench_oracle import Bench, MS, paper, Plant
 import numpy as np
-from one_sample import sample
 import pytest
 
 from hmsa_lab.adapt import adaptive_joint, corrections, estimator, window
@@ -137,9 +137,9 @@ def test_moves_that_get_worse_end_feedback_and_what_it_did_is_taken_back(monkeyp
     assert np.all(left[3:] < 0.1)
     assert 'feedback has ended, open loop with the parameters given; ~/reset_' in it.message
     assert it.estimates[-1].values['ended'] is True
-    assert 'feedback_ended' in it.codes
+    assert 'feedback_ended' in it.codes()
     # Nor does it ring where another level takes the place of what was learnt.
-    assert 'vibrating' not in it.codes
+    assert 'vibrating' not in it.codes()
     it.runtime.follower.reset()
     it.pass_time(300 * MS)
     assert it.estimates[-1].values['ended'] is False
@@ -185,7 +185,7 @@ def test_setpoints_that_have_not_begun_are_planned_with_what_was_learnt(monkeypa
         left.append(np.ptp(seen) / abs(target - before))
     assert left[0] > 0.05
     assert max(left[1:]) < 0.003
-    assert 'corrected' in it.codes
+    assert 'corrected' in it.codes()
 
 
 def test_a_fault_after_a_healthy_move_leaves_what_that_move_confirmed():

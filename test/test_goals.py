@@ -3,48 +3,30 @@
 from dataclasses import replace
 import math
 
+from at_work import AtWork, MS, planner, START
 import numpy as np
-from one_sample import sample
 import pytest
 
 from hmsa.model.actuators import Setup
 from hmsa.model.parameters import paper_actuator
-from hmsa.planning.group import PlannerGroup
-from hmsa.planning.planner import Options, Planner
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.runtime.goals import ErrorCode, Goals
-from hmsa_ros.runtime.records import (
-    Environment,
-    Send,
-    Settings,
-    StatusChanged,
-    Stop,
-    StretchRequest,
-    Trajectory,
-)
-from hmsa_ros.runtime.runtime import Runtime
+from hmsa_ros.runtime.records import StatusChanged, Stop, StretchRequest, Trajectory
 
-MS = 1_000_000
-START = 1000 * MS
 NAN = math.nan
 
 
-class Bench:
+class Bench(AtWork):
     """A runtime, its goals and simulated actuators with samples at 1 kHz."""
 
     def __init__(self, joints=('a',), shear_modulus=1.0, *, measured=True, **block):
         block = replace(paper_actuator(), **block)
         real = replace(block, shear_modulus=block.shear_modulus * shear_modulus)
-        self.now, self.measured = START, measured
+        self.measured = measured
         self.device = SimulatedDevice(
             [SimulatedJoint(Setup(real, real.rest)) for _ in joints], period=MS, time=START)
-        options = Options(flux_density_min=-0.5, flux_density_max=0.5)
-        self.runtime = Runtime(
-            PlannerGroup({x: Planner(block, options) for x in joints}),
-            Settings(takeover_timeout=0), Environment(
-                clock=lambda: self.now, steady=lambda: self.now,
-                observable=lambda: self.measured))
-        self.runtime.active = True
+        super().__init__(
+            {x: planner(block) for x in joints}, observable=lambda: self.measured)
         self.joints, self.truth, self.outcomes = list(joints), [], {}
         self.goals = Goals(self.runtime, self.outcomes.__setitem__)
         self.spoil = lambda stamp, stretch: (stamp, stretch)
@@ -60,10 +42,11 @@ class Bench:
             joints, rows, len(rows), stamp, name, path=path), **tolerances)
 
     def tick(self):
-        for x in self.runtime.tick(self.now):
-            if isinstance(x, Send):
-                self.device.receive(self.joints.index(x.joint), x.stamp, x.flux_density)
-            elif isinstance(x, StatusChanged):
+        begin = len(self.outputs)
+        for x in super().tick():
+            self.device.receive(self.joints.index(x.joint), x.stamp, x.flux_density)
+        for x in self.outputs[begin:]:
+            if isinstance(x, StatusChanged):
                 self.goals.update(x)
 
     def run(self, ms):
@@ -78,8 +61,7 @@ class Bench:
                 if self.measured:
                     for joint, true in zip(self.joints, x.stretch.tolist(), strict=True):
                         stamp, stretch = self.spoil(x.time, true)
-                        if self.runtime.looks_at(stamp):
-                            self.runtime.observed(joint, sample(stamp, stretch, came=self.now))
+                        self.show(stamp, stretch, joint)
                         self.goals.observe(joint, stamp, stretch, NAN, self.now)
         self.tick()
 

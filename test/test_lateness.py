@@ -4,35 +4,29 @@ from dataclasses import replace
 import math
 import random
 
+from at_work import AtWork, MS, planner, START
 from core_oracle import follow
 import numpy as np
 import pytest
 
 from hmsa.model.parameters import paper_actuator
 from hmsa.model.simulation import ActuatorSimulation
-from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Options, Planner
 from hmsa.planning.weighing import better_than_keeping
 from hmsa_ros.runtime.records import (
-    Environment,
-    Note,
-    Send,
     Settings,
     Severity,
     StatusChanged,
     Trajectory,
 )
-from hmsa_ros.runtime.runtime import Runtime
 
-MS = 1_000_000
-START = 1000 * MS
 LIMIT = 0.5
 QUIET = Settings(heartbeat_period=0, takeover_timeout=0)
 # A move that begins from rest, two more, and times to come to rest in, in units of time.
 TARGETS, SPAN = (1.2, 1.4, 1.1, 1.3), 8.0
 
 
-class Bench:
+class Bench(AtWork):
     """A runtime with a coil that writes late; SciPy simulates the actuator."""
 
     def __init__(
@@ -43,13 +37,11 @@ class Bench:
         self.block = replace(
             paper, density=paper.density * slow ** 2, damping_coefficient=1e-3 * slow)
         self.span = round(SPAN * unit * 1e9)
-        self.now, self.lead, self.write = START, lead, write
-        self.group = PlannerGroup({'a': Planner(self.block, Options(
-            shaper, flux_density_min=-LIMIT, flux_density_max=LIMIT, lead_time=lead))})
-        self.runtime = Runtime(
-            self.group, settings, Environment(clock=lambda: self.now, steady=lambda: 0))
-        self.runtime.active = True
-        self.ahead, self.applied, self.outputs, self.sent = [], [(0, 0.0)], [], []
+        self.lead, self.write = lead, write
+        super().__init__(
+            {'a': planner(self.block, shaper=shaper, lead_time=lead)}, settings,
+            steady=lambda: 0)
+        self.ahead, self.applied, self.sent = [], [(0, 0.0)], []
         self.number = 0
         # How late news come.
         self.lag = 0
@@ -64,11 +56,8 @@ class Bench:
     def run(self, span):
         end = self.now + span
         while self.now < end:
-            new = self.runtime.tick(self.now)
-            self.outputs += new
-            for x in new:
-                if isinstance(x, Send):
-                    self._take(x)
+            for x in self.tick():
+                self._take(x)
             due = [x.stamp for x in self.ahead] + [x[0] for x in self.news]
             wake = self.group.next_command()
             self.now = min([end, self.now + self.span // 40] + [
@@ -109,13 +98,6 @@ class Bench:
         return float(np.mean([
             self.left(x, abs(x - start), self.begin + end * self.span - 1)
             for x, start, end in zip(targets, starts, ends, strict=False)]))
-
-    @property
-    def status(self):
-        return [x for x in self.outputs if isinstance(x, StatusChanged)][-1]
-
-    def notes(self):
-        return [x.message for x in self.outputs if isinstance(x, Note)]
 
 
 def sequence(unit, lead, write, **more):

@@ -7,8 +7,8 @@ import math
 from pathlib import Path
 import random
 
+from at_work import AtWork, MS, planner, START
 import numpy as np
-from one_sample import sample
 import pytest
 
 from hmsa.interfaces.outcome import newest, Outcome
@@ -16,30 +16,16 @@ from hmsa.judge.records import SensorModel
 from hmsa.model.actuators import Setup
 from hmsa.model.parameters import paper_actuator
 from hmsa.model.sensor import SensorErrors
-from hmsa.planning.group import PlannerGroup
-from hmsa.planning.planner import Options, Planner
 from hmsa.report.outcome import findings_of
 from hmsa.runs.record import LearntSensor, RecordedLevel, Run
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
-from hmsa_ros.runtime.records import (
-    Environment,
-    EstimateChanged,
-    Send,
-    Settings,
-    StatusChanged,
-    Trajectory,
-)
-from hmsa_ros.runtime.runtime import Runtime
-
-MS = 1_000_000
-START = 1000 * MS
-
+from hmsa_ros.runtime.records import EstimateChanged, Send, Settings, StatusChanged, Trajectory
 
 # Experiments in which the planner does nothing for some time.
 STALLED = (2, 46, 124, 299)
 
 
-class Drawn:
+class Drawn(AtWork):
     """A random experiment: a planner and a simulated device in one loop of 1 ms."""
 
     def __init__(self, seed: int) -> None:
@@ -56,13 +42,9 @@ class Drawn:
             [SimulatedJoint(Setup(real, real.rest), errors=SensorErrors(
                 stretch_noise=draw.choice([0.0, 1e-4, 1e-3, 3e-3])))],
             period=1000 * MS // rate, time=START, seed=seed)
-        self.now = START
-        self.runtime = Runtime(
-            PlannerGroup({'a': Planner(block, Options(
-                flux_density_min=-0.5, flux_density_max=0.5, lead_time=50 * MS))}),
-            Settings(takeover_timeout=0, feedback=more.choice(['off', 'off', 'adapt'])),
-            Environment(clock=lambda: self.now, steady=lambda: self.now))
-        self.runtime.active = True
+        super().__init__(
+            {'a': planner(block, lead_time=50 * MS)},
+            Settings(takeover_timeout=0, feedback=more.choice(['off', 'off', 'adapt'])))
         hold = draw.choice([20, 60, 100, 200]) * MS
         self.late_for = draw.choice([20, 100, 400]) * MS
         self.points = [((round(draw.uniform(1.02, 1.4), 3),), hold * (i + 1))
@@ -121,8 +103,7 @@ class Drawn:
             for x in changed:
                 self.runtime.applied('a', x.stamp, x.level)
             for stamp, value, _ in read:
-                if self.runtime.looks_at(stamp):
-                    self.runtime.observed('a', sample(stamp, value, came=self.now))
+                self.show(stamp, value)
             changed, read = [], []
         time, logged, stretch = map(np.array, zip(*sorted(samples), strict=True))
         unknown = np.full(len(time), math.nan)

@@ -6,6 +6,7 @@ import json
 import math
 import re
 
+from at_work import AtWork, planner
 from core_oracle import integrate
 import numpy as np
 import pytest
@@ -16,10 +17,8 @@ from hmsa.cli import main
 from hmsa.model.creep import Creep
 from hmsa.model.parameters import paper_actuator
 from hmsa.model.status import Code, RefusedError
-from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Options, Planner
-from hmsa_ros.runtime.records import Environment, Settings, Severity, Trajectory
-from hmsa_ros.runtime.runtime import Runtime
+from hmsa_ros.runtime.records import Settings, Severity, Trajectory
 
 SECOND = 1_000_000_000
 # The paper's block: units of time (s) and load (T), damping, shape and chain limit.
@@ -238,37 +237,28 @@ def test_a_planner_follows_velocities_only_in_mode_path():
 
     request = Trajectory(('a',), rests(), len(points), path=[((x,), t) for x, t in points])
     for mode, severity in (('rest', Severity.ERROR), ('path', Severity.OK)):
-        group = PlannerGroup({'a': Planner(paper_actuator(), Options(
-            flux_density_min=-0.5, flux_density_max=0.5))})
-        runtime = Runtime(
-            group, Settings(trajectory_mode=mode, takeover_timeout=0), Environment(
-                clock=lambda: SECOND, steady=lambda: 0))
-        runtime.active = True
-        assert runtime.request(request).severity in (severity, Severity.OK)
-        while runtime.planning:
-            runtime.tick(SECOND)
-        assert len(group.planners['a'].plan.segments) == (mode == 'path')
+        work = AtWork({'a': planner()}, Settings(trajectory_mode=mode, takeover_timeout=0), SECOND)
+        assert work.runtime.request(request).severity in (severity, Severity.OK)
+        while work.runtime.planning:
+            work.tick()
+        assert len(work.planner.plan.segments) == (mode == 'path')
 
 
 def test_a_path_begins_soon_though_planning_takes_time():
-    now = [SECOND]
-
     def clock():
-        now[0] += 20_000_000
-        return now[0]
+        work.now += 20_000_000
+        return work.now
 
     points = dense(duration=0.3, count=301)
-    group = PlannerGroup({'a': Planner(paper_actuator(), Options(
-        flux_density_min=-0.5, flux_density_max=0.5, lead_time=5_000_000))})
-    runtime = Runtime(
-        group, Settings(trajectory_mode='path', takeover_timeout=0), Environment(
-            clock=clock, steady=lambda: 0))
-    runtime.active = True
-    runtime.request(Trajectory(
+    work = AtWork(
+        {'a': planner(lead_time=5_000_000)},
+        Settings(trajectory_mode='path', takeover_timeout=0), SECOND, clock=clock,
+        steady=lambda: 0)
+    work.runtime.request(Trajectory(
         ('a',), [], len(points), path=[((x,), t) for x, t in points]))
     for _ in range(1000):
-        runtime.tick(now[0])
-    assert group.planners['a'].plan.segments[0].begin < 5 * SECOND
+        work.tick()
+    assert work.planner.plan.segments[0].begin < 5 * SECOND
 
 
 def test_arrays_and_files_of_a_path_are_followed_too(tmp_path, capsys):

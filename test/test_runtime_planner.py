@@ -4,7 +4,7 @@ from dataclasses import replace
 import math
 from threading import Semaphore, Thread
 
-from one_sample import sample
+from at_work import AtWork, MS, sample, START
 import pytest
 
 from hmsa.errors import HmsaError
@@ -12,13 +12,9 @@ from hmsa.model.equations import natural_frequency
 from hmsa.model.parameters import paper_actuator
 from hmsa.model.simulation import ActuatorSimulation
 from hmsa.model.status import Code, RefusedError
-from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Options, Planner
 from hmsa_ros.runtime.records import (
-    Environment,
-    Note,
     PlanChanged,
-    Send,
     Settings,
     Severity,
     StatusChanged,
@@ -26,11 +22,8 @@ from hmsa_ros.runtime.records import (
     StretchRequest,
     Trajectory,
 )
-from hmsa_ros.runtime.runtime import Runtime
 from hmsa_ros.runtime.worker import Job
 
-MS = 1_000_000
-START = 1000 * MS
 LEAD = 50 * MS
 HOLD = 44 * MS
 SEQUENCE = ((1.1, HOLD), (1.2, 2 * HOLD), (1.4, 3 * HOLD))
@@ -82,13 +75,12 @@ class SlicedWorker:
         return Sliced(work, self._look)
 
 
-class Rig:
+class Rig(AtWork):
     """A runtime and actuators that obey it, with transport delay of commands."""
 
     def __init__(self, *, settings=QUIET, joints=('a',), blocks=None, **options):
         self.options = Options(flux_density_min=-0.5, flux_density_max=0.5, **options)
         self.blocks = blocks or dict.fromkeys(joints, paper_actuator())
-        self.now = START
         self.steady = 0
         # What each look at a clock takes.
         self.effort = 0
@@ -97,17 +89,13 @@ class Rig:
         self.observable = True
         self.unheard = ''
         self.found = True
-        self.group = PlannerGroup({
-            x: Planner(block, self.options) for x, block in self.blocks.items()})
-        self.runtime = Runtime(
-            self.group, settings, Environment(
-                clock=self.clock, steady=self.look, worker=SlicedWorker(self.look),
-                observable=lambda: self.observable, unheard=lambda: self.unheard,
-                found=lambda joint: self.found))
-        self.runtime.active = True
+        super().__init__(
+            {x: Planner(block, self.options) for x, block in self.blocks.items()}, settings,
+            clock=self.clock, steady=self.look, worker=SlicedWorker(self.look),
+            observable=lambda: self.observable, unheard=lambda: self.unheard,
+            found=lambda joint: self.found)
         self.plants = {
             x: ActuatorSimulation(block, time=START) for x, block in self.blocks.items()}
-        self.outputs = []
         self.sent = []
         self.wire = []
         self.transport = 0
@@ -132,23 +120,16 @@ class Rig:
         return self.steady
 
     @property
-    def planner(self):
-        return next(iter(self.group.planners.values()))
-
-    @property
     def plant(self):
         return next(iter(self.plants.values()))
 
     def tick(self):
-        begin = self.now
-        new = self.runtime.tick(begin)
-        self.outputs += new
-        for x in new:
-            if isinstance(x, Send):
-                # A tick sends first; what takes time comes after it.
-                self.sent.append((begin, x))
-                self.wire.append((begin + self.transport, x))
-        return new
+        begin, before = self.now, len(self.outputs)
+        for x in super().tick():
+            # A tick sends first; what takes time comes after it.
+            self.sent.append((begin, x))
+            self.wire.append((begin + self.transport, x))
+        return self.outputs[before:]
 
     def deliver(self):
         """Deliver the commands that are no longer in transit."""
@@ -181,16 +162,6 @@ class Rig:
             self.deliver()
             self.advance()
         self.tick()
-
-    @property
-    def status(self):
-        return [x for x in self.outputs if isinstance(x, StatusChanged)][-1]
-
-    def codes(self):
-        return [x.verdict.code for x in self.outputs if isinstance(x, StatusChanged)]
-
-    def notes(self):
-        return [x.message for x in self.outputs if isinstance(x, Note)]
 
     def observe(self, age=0):
         for name, plant in self.plants.items():

@@ -3,7 +3,7 @@
 from dataclasses import replace
 import math
 
-from one_sample import sample
+from at_work import sample
 import pytest
 from test_runtime_hosts import BEATING, Bench
 from test_runtime_planner import HOLD, MS, QUIET, Rig, SEQUENCE, START, trajectory

@@ -2,21 +2,17 @@
 
 import math
 
+from at_work import AtWork, MS, planner
 import numpy as np
-from one_sample import sample
 import pytest
 from scipy.integrate import solve_ivp
 from test_path import C1, force, LOAD, TIME, ZETA
 
 from hmsa import Actuator
 from hmsa.api.paths import smooth_points, wave_of, wave_path, wave_points
-from hmsa.model.parameters import paper_actuator
-from hmsa.planning.group import PlannerGroup
-from hmsa.planning.planner import Options, Planner
-from hmsa_ros.runtime.records import Environment, Send, Settings, StatusChanged, Stop, Trajectory
-from hmsa_ros.runtime.runtime import Runtime
+from hmsa_ros.runtime.records import Settings, Stop, Trajectory
 
-MS, SECOND = 1_000_000, 1_000_000_000
+SECOND = 1_000_000_000
 AMPLITUDE, LEAD = 0.1, 20 * MS
 NATURAL = math.sqrt(18.0 / (1.0 + C1)) / (2.0 * math.pi * TIME)
 EXACT = {'g': 1.0, 'damping': 1.0, 'remanence': 1.0, 'creep': 0.0}
@@ -52,24 +48,21 @@ class Plant:
         return self._state[0]
 
 
-class Run:
+class Run(AtWork):
     """A wave sent as a path, and its result."""
 
     def __init__(self, plant, share, *, shape='sine', cycles=10, noise=1e-4, feedback='adapt'):
-        self.plant, self.noise, self.begin, self.now = plant, noise, 0, SECOND
+        self.plant, self.noise = plant, noise
         self.frequency = share * NATURAL
         rows = smooth_points(*wave_points(wave_path(
             Actuator(), wave_of(Actuator(), shape, AMPLITUDE, None), (self.frequency,) * 2,
             cycles), TIME).T)
         self.times, self.wanted = rows[:, 0], rows[:, 1]
-        self.planner = Planner(paper_actuator(), Options(
-            flux_density_min=-0.5, flux_density_max=0.5, lead_time=LEAD, path_tolerance=1e-4))
-        self.runtime = Runtime(
-            PlannerGroup({'a': self.planner}),
-            Settings(takeover_timeout=0, heartbeat_period=0, feedback=feedback),
-            Environment(clock=lambda: self.now, steady=lambda: self.now))
-        self.runtime.active, self.runtime.environment.one_clock = True, lambda: True
-        self.sent, self.codes, self.truth = [], [], []
+        super().__init__(
+            {'a': planner(lead_time=LEAD, path_tolerance=1e-4)},
+            Settings(takeover_timeout=0, heartbeat_period=0, feedback=feedback), SECOND,
+            one_clock=lambda: True)
+        self.sent, self.truth = [], []
         self._random = np.random.default_rng(1)
         path = [((tuple(x),), round(t * SECOND)) for t, *x in rows.tolist()]
         self.runtime.request(Trajectory(
@@ -79,21 +72,16 @@ class Run:
     def go(self, seconds):
         """Advance to a time in s from the begin of the wave."""
         while self.now < self.begin + seconds * SECOND:
-            for x in self.runtime.tick(self.now):
-                if isinstance(x, Send):
-                    assert x.stamp >= self.now
-                    self.sent.append((x.stamp, x.flux_density))
-                    self.plant.commands.append(self.sent[-1])
-                elif isinstance(x, StatusChanged):
-                    self.codes.append(x.verdict.code)
+            for x in self.tick():
+                assert x.stamp >= self.now
+                self.sent.append((x.stamp, x.flux_density))
+                self.plant.commands.append(self.sent[-1])
             self.now += MS
             stretch = self.plant.at(self.now)
             self.truth.append((self.now, stretch))
             for stamp, level in [x for x in self.sent if self.now - MS < x[0] <= self.now]:
                 self.runtime.applied('a', stamp, level)
-            if self.runtime.looks_at(self.now):
-                self.runtime.observed('a', sample(
-                    self.now, stretch + self.noise * self._random.normal()))
+            self.show(self.now, stretch + self.noise * self._random.normal())
         return self
 
     @property
@@ -133,7 +121,7 @@ def test_amplitude_and_mean_come_back_and_the_wave_ends_at_rest(share, shape, cy
         run.go(end + 0.05)
         times, off = run.off
         ends.append(np.ptp(off[times > end + 0.005]))
-    assert closed.codes.count('corrected') < 8
+    assert closed.codes().count('corrected') < 8
     last = round(end * closed.frequency) - math.ceil(max(1.0, 2.0 * share))
     if shape == 'sine':
         assert abs(without.kept(last - 2, last)[0]) > 0.05
