@@ -15,6 +15,7 @@ from scipy.constants import mu_0
 from scipy.integrate import OdeSolution, solve_ivp
 
 from hmsa.model.parameters import ActuatorParameters, paper_actuator
+from hmsa.model.sensor import Sample
 
 Array = NDArray[np.float64]
 #: Possible deviations, by name.
@@ -377,11 +378,11 @@ class Device:
         found, self.plant.applied = self.plant.applied, []
         return [(0, *x) for x in found]
 
-    def samples(self) -> Sequence[tuple[int, Array, Array, Array]]:
+    def samples(self) -> Sequence[Sample]:
         """Return samples that have arrived: timestamp, stretch, and NaN for rate and field."""
         found = []
         nothing = np.array([math.nan])
         while self._wire and self._wire[0][0] <= self.time:
             _, stamp, value = self._wire.pop(0)
-            found.append((stamp, np.array([value]), nothing, nothing))
+            found.append(Sample(stamp, np.array([value]), nothing, nothing))
         return found
