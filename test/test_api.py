@@ -172,6 +172,7 @@ def test_limits_laws_creep_lag_and_beams_reach_the_plan(block):
     with pytest.raises(hmsa.HmsaError, match=r'needs a flux density of .* expected -0.1 T to'):
         block.plan([(1.4, 0.5)], limits=0.1)
     slow = block.replace(coil_time_constant=1e-3, creep=[(0.2, 1.0)])
+    assert slow.scales == block.scales
     made = slow.plan([(1.1, 0.5)])
     assert len(made.times) > 3
     assert made.simulate().report()['verdict'] == ['arrived']

@@ -55,12 +55,12 @@ def scales(actuator: ActuatorParameters, least: float, most: float) -> Scales:
     """
     Compute the derived quantities of parameters and the range of a coil in T.
 
-    Ramps are neglected. Raise `BadInputError` if the range is empty or infinite.
+    Ramps and creep are neglected. Raise `BadInputError` if the range is empty or infinite.
     """
     if not -math.inf < least < most < math.inf:
         raise BadInputError(
             f'flux densities from {least:g} to {most:g} T: expected the minimum below the maximum')
-    material = actuator.nondimensional
+    material = actuator.nondimensional.elastic
     home = material.rest
     units = actuator.units
     loads = units.of_level(least), units.of_level(most)
