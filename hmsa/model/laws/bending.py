@@ -9,6 +9,7 @@ work of a uniform field across it is that of a constant force at the tip. In the
 the same for every beam.
 """
 
+from collections.abc import Callable
 from functools import cache
 
 import numpy as np
@@ -23,7 +24,7 @@ LARGEST_ANGLE = np.radians(80.0)
 # End of the tables, where an artificial stop begins.
 _TABLE_ANGLE = np.radians(95.0)
 # Points of the quadrature along the beam, and number and degree of the pieces of the tables.
-_POINTS, _PIECES, _DEGREE = 48, 96, 7
+_POINTS, _PIECES, DEGREE = 48, 96, 7
 _NEWTON = 60
 
 
@@ -118,38 +119,63 @@ def centreline(deflected: float, points: int) -> tuple[Array, Array]:
     return sums[0], sums[1]
 
 
-@cache
-def packed() -> tuple[float, ...]:
+def tabulated(
+        fold: float, end: float, count: int, quantities: Callable[[Array], Array],
+        energy: Callable[[Array, Array, Array], Array]) -> tuple[float, ...]:
     """
     Return the constants of ``Beam`` in ``motion/hmsa/system.hpp``.
 
     The order is: number of pieces; deflections of the fold and of the end of the tables; inverse
     width of the pieces in ``1 - sqrt(1 - u/fold)``; force, stiffness, inertia and damping at the
     end. For each piece follow its initial deflection and energy, and the polynomial coefficients
-    of force, inertia and damping.
+    of the quantities.
+
+    Parameters
+    ----------
+    fold, end : float
+        Deflections of the fold and of the end of the tables.
+    count : int
+        Number of pieces.
+    quantities : callable
+        Returns force, inertia, damping and further quantities, shape (m, p, n), at deflections of
+        shape (p, n).
+    energy : callable
+        Returns the energies at the starts of the pieces, (p,), of these, their widths, and the
+        coefficients of the force, (p, n).
+
     """
-    most = float(deflection(fold()))
-    end = float(deflection(_TABLE_ANGLE))
-    share = (1.0 - np.sqrt(1.0 - end / most)) / _PIECES
-    breaks = most * (1.0 - (1.0 - share * np.arange(_PIECES + 1)) ** 2)
+    share = (1.0 - np.sqrt(1.0 - end / fold)) / count
+    breaks = fold * (1.0 - (1.0 - share * np.arange(count + 1)) ** 2)
     breaks[-1] = end
     widths = np.diff(breaks)
-    nodes = 0.5 - 0.5 * np.cos(np.pi * (np.arange(_DEGREE + 1) + 0.5) / (_DEGREE + 1))
-    angle = angle_of(breaks[:-1, None] + widths[:, None] * nodes)
-    per, rest = _gain(angle), float(_gain(0.0))
-    values = np.stack([
-        3.0 * rest ** 2 * angle / per, 4.0 * inertia_of_angle(angle) / per ** 2,
-        (rest / per) ** 2])
-    powers = nodes[:, None] ** np.arange(_DEGREE + 1)
+    nodes = 0.5 - 0.5 * np.cos(np.pi * (np.arange(DEGREE + 1) + 0.5) / (DEGREE + 1))
+    values = quantities(breaks[:-1, None] + widths[:, None] * nodes)
+    powers = nodes[:, None] ** np.arange(DEGREE + 1)
     factors = np.linalg.solve(powers, values[..., None])[..., 0]
-    pieces = factors / widths[:, None] ** np.arange(_DEGREE + 1)
+    pieces = factors / widths[:, None] ** np.arange(DEGREE + 1)
     # The force on a straight beam is exactly zero.
     pieces[0, 0, 0] = 0.0
-    at_end = widths[-1] ** np.arange(_DEGREE + 1)
-    last = pieces[:, -1] @ at_end
-    stiffness = float(pieces[0, -1, 1:] @ (np.arange(1, _DEGREE + 1) * at_end[:-1]))
-    energy = 1.5 * (rest * angle_of(breaks[:-1])) ** 2
-    rows = np.column_stack([breaks[:-1], energy, *pieces])
+    at_end = widths[-1] ** np.arange(DEGREE + 1)
+    force, inertia, damping = (pieces[:3, -1] @ at_end).tolist()
+    stiffness = float(pieces[0, -1, 1:] @ (np.arange(1, DEGREE + 1) * at_end[:-1]))
+    rows = np.column_stack([breaks[:-1], energy(breaks[:-1], widths, pieces[0]), *pieces])
     return (
-        float(_PIECES), most, end, float(1.0 / share), float(last[0]), stiffness, float(last[1]),
-        float(last[2]), *rows.ravel().tolist())
+        float(count), fold, end, float(1.0 / share), force, stiffness, inertia, damping,
+        *rows.ravel().tolist())
+
+
+@cache
+def packed() -> tuple[float, ...]:
+    """Return the constants of ``Beam`` in ``motion/hmsa/system.hpp``; see `tabulated`."""
+    rest = float(_gain(0.0))
+
+    def quantities(at: Array) -> Array:
+        angle = angle_of(at)
+        per = _gain(angle)
+        return np.stack([
+            3.0 * rest ** 2 * angle / per, 4.0 * inertia_of_angle(angle) / per ** 2,
+            (rest / per) ** 2])
+
+    return tabulated(
+        float(deflection(fold())), float(deflection(_TABLE_ANGLE)), _PIECES, quantities,
+        lambda starts, widths, force: 1.5 * (rest * angle_of(starts)) ** 2)

@@ -27,15 +27,15 @@ import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import ArrayLike, NDArray
 
-from hmsa.model.laws.bending import angle_of, ROOT, slope
+from hmsa.model.laws.bending import angle_of, DEGREE, ROOT, slope, tabulated
 
 Array = NDArray[np.float64]
 
 # Polynomials of the rotation, and points of the quadrature: with twice as many, the functions
 # change by 1e-12 of their values (test_elastica).
 _TERMS, _POINTS = 16, 48
-# Number and degree of the pieces of the tables, their end, and the deflection of a stop.
-_PIECES, _DEGREE = 32, 7
+# Number of pieces of the tables, their end, and the deflection of a stop.
+_PIECES = 32
 _END, _STOP = 0.86, 1.0
 _NEWTON, _EXACT, _NEAR = 40, 1e-13, 1e-6
 # Steps to a deflection: at once, Newton's method diverges above 0.85 with the rounding of some
@@ -168,37 +168,24 @@ def second_mode() -> Second:
 @cache
 def packed() -> tuple[float, ...]:
     """
-    Return the constants of ``Beam`` in ``motion/hmsa/system.hpp``.
+    Return the constants of ``Beam`` in ``motion/hmsa/system.hpp``; see `bending.tabulated`.
 
-    The order is that of `hmsa.model.laws.bending.packed`. Each piece has further coefficients, of
-    g, h, l, e and k over their values at rest.
+    Each piece has further coefficients, of g, h, l, e and k over their values at rest.
     """
-    share = (1.0 - np.sqrt(1.0 - _END / _STOP)) / _PIECES
-    breaks = _STOP * (1.0 - (1.0 - share * np.arange(_PIECES + 1)) ** 2)
-    breaks[-1] = _END
-    widths = np.diff(breaks)
-    nodes = 0.5 - 0.5 * np.cos(np.pi * (np.arange(_DEGREE + 1) + 0.5) / (_DEGREE + 1))
-    at = breaks[:-1, None] + widths[:, None] * nodes
-    values = _Rod().states(at.ravel()).reshape(8, *at.shape)
-    values[1:] /= _straight()[1:, None, None]
-    # The first frequency of a straight beam is sqrt(3), with a stiffness of 3 `FIRST_SHARE`.
-    values[:2] *= FIRST_SHARE
-    powers = nodes[:, None] ** np.arange(_DEGREE + 1)
-    factors = np.linalg.solve(powers, values[..., None])[..., 0]
-    pieces = factors / widths[:, None] ** np.arange(_DEGREE + 1)
-    # The force on a straight beam is exactly zero.
-    pieces[0, 0, 0] = 0.0
-    at_end = widths[-1] ** np.arange(_DEGREE + 1)
-    last = pieces[:3, -1] @ at_end
-    stiffness = float(pieces[0, -1, 1:] @ (np.arange(1, _DEGREE + 1) * at_end[:-1]))
-    # The energy is the integral of the force.
-    within = (pieces[0] / np.arange(1, _DEGREE + 2)
-              * widths[:, None] ** np.arange(1, _DEGREE + 2)).sum(axis=1)
-    rows = np.column_stack([
-        breaks[:-1], np.append(0.0, np.cumsum(within)[:-1]), *pieces])
-    return (
-        float(_PIECES), _STOP, _END, float(1.0 / share), float(last[0]), stiffness,
-        float(last[1]), float(last[2]), *rows.ravel().tolist())
+    def quantities(at: Array) -> Array:
+        values = _Rod().states(at.ravel()).reshape(8, *at.shape)
+        values[1:] /= _straight()[1:, None, None]
+        # The first frequency of a straight beam is sqrt(3), with a stiffness of 3 `FIRST_SHARE`.
+        values[:2] *= FIRST_SHARE
+        return values
+
+    def energy(starts: Array, widths: Array, force: Array) -> Array:
+        # The integral of the force.
+        within = (force / np.arange(1, DEGREE + 2)
+                  * widths[:, None] ** np.arange(1, DEGREE + 2)).sum(axis=1)
+        return np.append(0.0, np.cumsum(within)[:-1])
+
+    return tabulated(_STOP, _END, _PIECES, quantities, energy)
 
 
 def lever(deflections: ArrayLike) -> tuple[Array, Array]:
@@ -209,7 +196,7 @@ def lever(deflections: ArrayLike) -> tuple[Array, Array]:
     piece = np.searchsorted(breaks, size, side='right') - 1
     within, rows = size - breaks[piece], factors[piece]
     value = slope_there = np.zeros_like(size)
-    for k in range(_DEGREE, -1, -1):
+    for k in range(DEGREE, -1, -1):
         slope_there = slope_there * within + value
         value = value * within + rows[..., k]
     return value, np.sign(wanted) * slope_there
@@ -219,5 +206,5 @@ def lever(deflections: ArrayLike) -> tuple[Array, Array]:
 def _lever_pieces() -> tuple[Array, Array]:
     """Return the starts of the pieces, and the polynomial coefficients of g over its rest."""
     rows = np.array(packed()[8:]).reshape(_PIECES, -1)
-    first = 2 + 3 * (_DEGREE + 1)
-    return rows[:, 0], rows[:, first:first + _DEGREE + 1]
+    first = 2 + 3 * (DEGREE + 1)
+    return rows[:, 0], rows[:, first:first + DEGREE + 1]
