@@ -67,24 +67,24 @@ def _held(block: ActuatorParameters, mount: str, ratio: float | None) -> Actuato
             mass_factor=found.mass_factor, transverse_mass_factor=found.transverse_mass_factor,
             transverse_mass_exponent=found.transverse_mass_exponent, modes=found.modes)
 
-    first = made(0.0)
-    critical = float(critical_zeta(1.0, first.nondimensional))
-    if ratio is None:
-        ratio = first.nondimensional.zeta / critical
-    else:
-        block = replace(block, damping_coefficient=ratio * critical * first.damping_unit)
-    return made(ratio)
+    ratio, coefficient = _damped(made(0.0), ratio)
+    return replace(made(ratio), damping_coefficient=coefficient)
 
 
 def _clamped(beam: ActuatorParameters, _: str, ratio: float | None) -> ActuatorParameters:
     """Return a beam along its elastica, with its second mode."""
     made = along_elastica(beam)
-    critical = float(critical_zeta(0.0, made.nondimensional))
+    ratio, coefficient = _damped(made, ratio)
+    return replace(made, damping_coefficient=coefficient, modes=clamped(ratio))
+
+
+def _damped(made: ActuatorParameters, ratio: float | None) -> tuple[float, float]:
+    """Return damping ratio and coefficient for a given ratio, by default for the coefficient."""
+    material = made.nondimensional
+    critical = float(critical_zeta(material.rest, material))
     if ratio is None:
-        ratio = made.nondimensional.zeta / critical
-    else:
-        made = replace(made, damping_coefficient=ratio * critical * made.damping_unit)
-    return replace(made, modes=clamped(ratio))
+        return material.zeta / critical, made.damping_coefficient
+    return ratio, ratio * critical * made.damping_unit
 
 
 def further_facts(actuator: ActuatorParameters) -> list[tuple[str, str]]:
