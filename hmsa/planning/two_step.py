@@ -91,8 +91,7 @@ def plan_two_step(
         raise BadInputError(f'rtol is {rtol!r}: expected 1e-14 to 1e-4')
     if material.creeps:
         raise BadInputError(
-            'the group has Maxwell branches: expected one without, or plan_sequence for one that '
-            'creeps')
+            'the material creeps: expected one without viscoelastic branches, or plan_sequence')
     least, most = load_limits
     status, beta_p, tau_p, beta_1, passes = motion.two_step(
         start, rate, target, material.packed, least, most, rtol, HOLD_TOLERANCE)
