@@ -81,9 +81,12 @@ EXTRAS_REQUIRE = {
     'panel': [
         'tornado>=6.2',
     ],
-    # DataFrames of plans, motions and tables; quantities with units.
+    # DataFrames, Datasets, and quantities with units in Python.
     'pandas': [
         'pandas>=1.5',
+    ],
+    'xarray': [
+        'xarray>=2023.1',
     ],
     'units': [
         'pint>=0.20',

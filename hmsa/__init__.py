@@ -20,6 +20,7 @@ line. Nothing here depends on ROS; ``hmsa_ros`` contains the nodes.
 """
 
 from importlib import import_module
+import sys
 from typing import TYPE_CHECKING
 
 __version__ = '0.2.0'
@@ -52,7 +53,9 @@ _HOMES = {
 if not TYPE_CHECKING:
     def __getattr__(name):
         if name not in _HOMES:
-            raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
+            raise AttributeError(
+                f'module {__name__!r} has no attribute {name!r}',
+                name=name, obj=sys.modules[__name__])
         found = globals()[name] = getattr(import_module(f'{__name__}.{_HOMES[name]}'), name)
         return found
 

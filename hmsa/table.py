@@ -259,7 +259,25 @@ def frame(columns: dict[str, Any]) -> Any:
     try:
         import pandas
     except ImportError as error:
-        raise BadInputError(
-            "pandas is not installed: install it (pip install pandas, or the extra 'pandas' of "
-            'this package), or take the columns as arrays') from error
+        raise _missing('pandas') from error
     return pandas.DataFrame(columns)
+
+
+def dataset(columns: dict[str, Any], units: dict[str, str]) -> Any:
+    """
+    Return columns as an xarray Dataset over the column ``time``, with units as attributes.
+
+    Raise `BadInputError` if xarray is not installed.
+    """
+    try:
+        import xarray
+    except ImportError as error:
+        raise _missing('xarray') from error
+    return xarray.Dataset({x: ('time', y, {'units': units[x]}) for x, y in columns.items()})
+
+
+def _missing(name: str) -> BadInputError:
+    """Return the error for an optional package that is not installed."""
+    return BadInputError(
+        f'{name} is not installed: install it (pip install {name}, or the extra {name!r} of this '
+        'package), or take the columns as arrays')

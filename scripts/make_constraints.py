@@ -11,7 +11,7 @@ import sys
 import tempfile
 
 ROOT = Path(__file__).resolve().parent.parent
-EXTRAS = 'test,lint,sweep,panel,pandas,units,bench,docs,release'
+EXTRAS = 'test,lint,sweep,panel,pandas,xarray,units,bench,docs,release'
 HEADER = """\
 # What the package was last tested with, all of it, for Python {first} to {last}: written by
 #     make constraints {choice}PYTHONS='{commands}'

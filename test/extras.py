@@ -8,7 +8,8 @@ import pytest
 # Of a module that the extra `test` does not bring, the smallest extra that does.
 EXTRAS = {
     'dask': 'sweep', 'distributed': 'sweep', 'pandas': 'pandas', 'pint': 'units',
-    'pyarrow': 'sweep', 'rclpy': 'ros', 'sphinx': 'docs', 'tornado': 'panel'}
+    'pyarrow': 'sweep', 'rclpy': 'ros', 'sphinx': 'docs', 'tornado': 'panel',
+    'xarray': 'xarray'}
 
 
 def needs(module: str) -> Any:

@@ -127,8 +127,9 @@ def test_everything_public_has_an_example_that_prints_what_it_shows(
         thing, tmp_path, monkeypatch):
     thing = inspect.unwrap(thing)
     text = inspect.getdoc(thing)
-    if 'to_pandas()' in text:
-        needs('pandas')
+    for package in ('pandas', 'xarray'):
+        if f'to_{package}()' in text:
+            needs(package)
     found = doctest.DocTestParser().get_doctest(text, {}, getattr(
         thing, '__qualname__', 'hmsa'), inspect.getsourcefile(thing), 0)
     assert found.examples
@@ -425,6 +426,7 @@ def test_a_plan_is_a_sequence_of_its_levels_and_a_table_one_of_its_rows(block):
     assert (plan[-1].time, plan[-1].flux_density) == tuple(plan.levels[-1])
     # Its slices are levels that can be simulated.
     assert block.simulate(plan[:2], until=0.4).stretches[-1] == pytest.approx(1.1, abs=1e-6)
+    assert plan[2].time == plan.setpoints[0, 1]  # to the last digit
     table = plan.report()
     assert [x['status'] for x in table] == table['status']
     assert (table[1], table[1:]['stretch']) == (table.records()[1], [1.0])
@@ -506,6 +508,7 @@ def test_a_quantity_of_another_dimension_is_refused(block, wrong, said):
     (lambda x: x.plan([(1.1, 1.0)]).plot(ax=Figure().subplots(), panel='comand'), 'command'),
     (lambda x: x.report()['values'], 'value'),
     (lambda x: hmsa.identify(x.simulate(LEVELS), free=['remanance']), 'remanence'),
+    (lambda x: hmsa.compare(*[x.simulate(LEVELS)] * 2, pictur='a.png'), 'picture'),
     (lambda x: hmsa.read('run', joit='a'), 'joint')])
 def test_a_misspelt_argument_is_named_with_the_one_that_is_meant(block, misspelt, meant):
     with pytest.raises((TypeError, hmsa.BadInputError), match=f'did you mean {meant}[?]'):

@@ -36,7 +36,7 @@ MODULES = {'PyYAML': 'yaml', 'mcap-ros2-support': 'mcap_ros2'}
 # What only a part of the package needs.
 OPTIONAL = {'dask', 'distributed', 'pyarrow', 'tornado'}
 # What the package asks for in one line where it is missing: the user's choice.
-BESIDE = {'pandas'}
+BESIDE = {'pandas', 'xarray'}
 # Needed to install, or to be launched, not to be imported.
 NOT_IMPORTED = {'setuptools', 'ros2launch'}
 # What setup() was called with, without building anything.
@@ -258,7 +258,7 @@ def test_every_file_that_names_the_supported_pythons_names_the_same():
         spans = re.findall(r'Python 3\.\d+ to 3\.\d+', (ROOT / name).read_text(encoding='utf-8'))
         assert set(spans) == {span}, name
     commands = ' '.join(f'python{x}' for x in PYTHONS)
-    for name in ('CONTRIBUTING.md', 'Makefile', 'constraints.txt'):
+    for name in ('Makefile', 'constraints.txt'):
         assert commands in (ROOT / name).read_text(encoding='utf-8'), name
     low, high = (x.replace('.', ', ') for x in (PYTHONS[0], PYTHONS[-1]))
     assert f'({low}) <= sys.version_info[:2] <= ({high})' in (ROOT / 'Makefile').read_text()

@@ -16,8 +16,8 @@ from hmsa.model.simulation import longest_motion, response
 from hmsa.model.units import NANOSECONDS
 from hmsa.runs.record import read_only, RecordedLevel, Run
 from hmsa.runs.setpoints import described
-from hmsa.runs.tables import levels_of, samples_of, write_run
-from hmsa.table import frame, Table
+from hmsa.runs.tables import levels_of, samples_of, UNITS, write_run
+from hmsa.table import dataset, frame, Table
 
 if TYPE_CHECKING:
     from hmsa.api.actuator import Actuator
@@ -203,7 +203,25 @@ class Motion:
         ((721, 3), 1.1)
 
         """
-        return frame(dict(samples_of(self.run)))
+        return frame(samples_of(self.run))
+
+    def to_xarray(self) -> Any:
+        """
+        Return the samples as an xarray Dataset over the time, with units as attributes.
+
+        Raise `BadInputError` if xarray is not installed.
+
+        Examples
+        --------
+        >>> from hmsa import Actuator
+        >>> samples = Actuator().plan([(1.1, 0.2)]).simulate().to_xarray()
+        >>> samples['stretch'].dims, samples['time'].units
+        (('time',), 's')
+        >>> round(float(samples['stretch'].sel(time=0.15, method='nearest')), 3)
+        1.1
+
+        """
+        return dataset(samples_of(self.run), UNITS)
 
     def __repr__(self) -> str:
         times = self.times
@@ -309,7 +327,7 @@ def compare(
     elif paper and ax is None:
         raise BadInputError(
             f'{", ".join(paper)} given without a picture: expected picture, the file to draw, or '
-            'ax')
+            'ax' + ''.join(meant(x, ('picture', 'ax', 'panel')) for x in paper))
     if ax is not None:
         for each in motions:
             _draw_into(ax, each, panel, paper)

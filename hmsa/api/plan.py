@@ -15,10 +15,11 @@ from hmsa.api.motion import Motion, simulated
 from hmsa.errors import BadInputError, excerpt
 from hmsa.model.equations import Array
 from hmsa.model.status import Code
+from hmsa.model.units import DECIMALS
 from hmsa.planning.sequence import Segment
 from hmsa.runs.record import read_only
-from hmsa.runs.tables import write_table
-from hmsa.table import Column, frame, Table
+from hmsa.runs.tables import UNITS, write_table
+from hmsa.table import Column, dataset, frame, Table
 
 _MOST_BETWEEN = 4
 
@@ -96,7 +97,8 @@ class Plan:
             rows += [(segment.begin + x.time, x.load) for x in segment.move.levels
                      if last or x.time < segment.setpoint.span]
         times, loads = np.array(rows).T
-        return read_only(np.column_stack([times * units.time, units.level(loads)]))
+        return read_only(np.column_stack([
+            np.round(times * units.time, DECIMALS), units.level(loads)]))
 
     @property
     def times(self) -> Array:
@@ -118,14 +120,14 @@ class Plan:
     def setpoints(self) -> Array:
         """Stretches and durations in s, shape (n, 2)."""
         return read_only(np.array([
-            (x.setpoint.stretch, x.setpoint.span * self.actuator.model.units.time)
+            (x.setpoint.stretch, self.actuator.model.units.duration(x.setpoint.span))
             for x in self.segments]))
 
     @property
     def move_times(self) -> Array:
         """Move times in s; infinite where a target is only approached, shape (n,)."""
-        return read_only(np.array(
-            [x.move.duration for x in self.segments]) * self.actuator.model.units.time)
+        times = np.array([x.move.duration for x in self.segments])
+        return read_only(np.round(times * self.actuator.model.units.time, DECIMALS))
 
     def __len__(self) -> int:
         return len(self.levels)
@@ -190,10 +192,10 @@ class Plan:
             self.segments, (
                 Column(name), Column('duration', 's'), Column('first level', unit),
                 Column('move time', 's'), Column('last level', unit)),
-            [(x.setpoint.stretch, x.setpoint.span * units.time,
-              level(x.move.levels[0].load) if x.shaped else None,
-              x.move.duration * units.time if x.shaped and math.isfinite(x.move.duration)
-              else None, level(x.held)) for x in self.segments],
+            [(*setpoint, level(x.move.levels[0].load) if x.shaped else None,
+              duration if x.shaped and math.isfinite(duration) else None, level(x.held))
+             for x, setpoint, duration in zip(
+                 self.segments, self.setpoints.tolist(), self.move_times.tolist(), strict=True)],
             Column('between', f'{unit} at s'), units.time, level)
 
     @suggesting
@@ -282,7 +284,7 @@ class Plan:
         time,flux_density
 
         """
-        write_table(file_of(path), {'time': self.times, 'flux_density': self.flux_densities})
+        write_table(file_of(path), self._columns())
 
     def to_pandas(self) -> Any:
         """
@@ -299,7 +301,26 @@ class Plan:
         1  0.0057        0.0346
 
         """
-        return frame({'time': self.times, 'flux_density': self.flux_densities})
+        return frame(self._columns())
+
+    def to_xarray(self) -> Any:
+        """
+        Return the levels as an xarray Dataset over the time, with units as attributes.
+
+        Raise `BadInputError` if xarray is not installed.
+
+        Examples
+        --------
+        >>> from hmsa import Actuator
+        >>> levels = Actuator().plan([(1.1, 0.5)]).to_xarray()
+        >>> levels['flux_density'].round(4).values.tolist(), levels['flux_density'].units
+        ([0.0201, 0.0346], 'T')
+
+        """
+        return dataset(self._columns(), UNITS)
+
+    def _columns(self) -> dict[str, Array]:
+        return {'time': self.times, 'flux_density': self.flux_densities}
 
     def _values(self) -> tuple[object, ...]:
         """Return what makes plans equal; adding 0 makes -0 and 0 the same bytes."""

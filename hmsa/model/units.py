@@ -5,6 +5,8 @@ from typing import Any
 
 #: Nanoseconds in a second; times that must not drift are integer nanoseconds.
 NANOSECONDS = 1_000_000_000
+#: Decimals of a time in s to the nanosecond.
+DECIMALS = 9
 #: Vacuum permeability in H/m (CODATA 2022); SciPy's table of constants takes 0.2 s to load.
 MU_0 = 1.25663706127e-6
 
@@ -23,6 +25,10 @@ class Units:
     time_name: str = ''  #: with a leading space; empty for dimensionless values, as load_name
     load_name: str = ''
     coordinate: str = 'stretch'  #: name of a position
+
+    def duration(self, value: float) -> float:
+        """Return a dimensionless duration in the unit of time, to 15 digits, as it was given."""
+        return float(f'{value * self.time:.15g}')
 
     def level(self, load: Any) -> Any:
         """Return the flux density of a load or array."""

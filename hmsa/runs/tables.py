@@ -17,6 +17,10 @@ from hmsa.runs.record import held_at, Run
 SUFFIXES = ('.csv', '.parquet', '.mat')
 
 
+#: Units of the columns of samples and levels.
+UNITS = {'time': 's', 'stretch': '1', 'stretch_rate': '1/s', 'flux_density': 'T'}
+
+
 def samples_of(run: Run) -> dict[str, Array]:
     """
     Return the samples of a run by column name.
