@@ -7,7 +7,7 @@ ROS ?= jazzy
 VENV ?= .venv$(if $(filter-out jazzy,$(ROS)),-$(ROS))
 # Passed to the command or to pytest, as in: make demo ARGS='--out /tmp/demo --json'
 ARGS ?=
-# For make constraints.
+# For make constraints and make release.
 PYTHONS ?= python3.10 python3.11 python3.12 python3.13 python3.14
 
 BIN := $(VENV)/bin
@@ -90,10 +90,10 @@ pictures: tools ## redraw the pictures of the documentation
 	$(BIN)/python scripts/draw_docs.py $(ARGS)
 
 .PHONY: release
-release: env ## build sdist and wheels into dist/, and test them in empty environments
+release: env ## build sdist and wheels into dist/, and test them with each of $(PYTHONS)
 	$(EXTRAS) release > $(VENV)/extras.txt
 	$(INSTALL) -r $(VENV)/extras.txt
-	$(BIN)/python scripts/make_release.py $(ARGS)
+	$(BIN)/python scripts/make_release.py $(PYTHONS)
 
 .PHONY: constraints
 constraints: ## rewrite constraints.txt (with ROS=kilted, its own file), with each of $(PYTHONS)
