@@ -42,7 +42,7 @@ class BagError(HmsaError):
 
 class AssumedWarning(UserWarning):
     """
-    An assumption that the input leaves open, such as which of its columns is the time.
+    An assumption about ambiguous input, such as which of its columns is the time.
 
     ``warnings.simplefilter('ignore', hmsa.AssumedWarning)`` accepts all of them; commands show
     each as one line.

@@ -251,7 +251,7 @@ def _factor(belief: NormalColumns) -> list[list[float]]:
         left = given[i] - math.fsum(x * x for x in row)
         if not left >= -_ROUNDING * abs(given[i]):
             raise BadInputError(
-                f'the covariance of {", ".join(belief.names)} is none, at {belief.names[i]}: '
+                f'the covariance of {", ".join(belief.names)} is impossible at {belief.names[i]}: '
                 'expected a matrix that is positive semidefinite, as hmsa identify writes it')
         rows.append([*row, math.sqrt(max(left, 0.0))])
     return rows

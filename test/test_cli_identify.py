@@ -272,7 +272,7 @@ def test_a_few_samples_of_nothing_are_no_other_unit(folder, capsys):
     (['nowhere.csv'], 'nowhere.csv cannot be read'),
     (['camera.csv'], 'no column flux_density'),
     (['camera.csv', '--commands', 'levels.csv', '--free', 'mass'], "free parameter 'mass'"),
-    (['camera.csv', '--commands', 'levels.csv', '--free=-density'], 'takes away a parameter'),
+    (['camera.csv', '--commands', 'levels.csv', '--free=-density'], 'removes a parameter'),
     (['camera.csv', '--commands', 'levels.csv', '--known', 'half_length=5mm+-'],
      "half_length is '': expected a number"),
     (['camera.csv', '--commands', 'levels.csv', '--known', 'half_length=-1mm'],

@@ -235,7 +235,7 @@ def test_nondimensional_parameters_do_not_go_with_a_parameter_file(run, params_f
 
 
 def test_a_covariance_that_is_none_is_refused():
-    with pytest.raises(BadInputError, match=r'is none, at b: expected'):
+    with pytest.raises(BadInputError, match=r'is impossible at b: expected'):
         draw({}, NormalColumns(('a', 'b'), np.zeros(2), np.array([[1.0, 2.0], [2.0, 1.0]])), 8, 0)
 
 

@@ -136,8 +136,8 @@ def test_a_wave_that_is_only_possible_about_the_resonance_has_both_limits():
     ('sine', {'cycles': 0.5}, 'cycles is 0.5'),
     ('sine', {'last': -3.0}, 'frequency is -3 Hz'),
     ([(0.0, 1.0), (1.0, 1.1)], {}, 'at least 4 samples'),
-    ([(x, 1.0) for x in range(5)], {}, 'not constant'),
-    ([(x, 1.0 + x) for x in range(5)], {}, 'the last sample repeats the first')])
+    ([(x, 1.0) for x in range(5)], {}, 'stretches that vary'),
+    ([(x, 1.0 + x) for x in range(5)], {}, 'a last sample equal to the first')])
 def test_what_is_no_wave_is_refused(shape, values, words):
     with pytest.raises(BadInputError, match=words):
         Actuator().wave(shape, **{'frequency': 20.0, 'amplitude': 0.05, **values})
@@ -159,7 +159,7 @@ def test_the_command_tells_the_reach_first_and_writes_levels(tmp_path, capsys):
     assert np.ptp(stretch) == pytest.approx(0.1, rel=1e-3)
     assert np.all(np.diff(times) > 0.0)
     assert main(['wave', 'square', *wave[2:], '--path', str(out)]) == 2
-    assert 'a square wave is no path: expected' in capsys.readouterr().err
+    assert 'a square wave is not a path, because it jumps: expected' in capsys.readouterr().err
     assert main(['wave', str(tmp_path), *wave[2:]]) == 2
     assert 'cannot be read (Is a directory): expected a CSV' in capsys.readouterr().err
     for extra, words in ((['--to', '40'], 'expected --to HZ with sweep'),

@@ -65,8 +65,8 @@ def amplifiers(
     swing = float(np.max(np.abs(np.diff(np.append(before, best.flux_densities)))))
     if not 0.0 < fastest < math.inf or not swing:
         raise BadInputError(
-            f'shaper {best.shaper} has no moves of a finite duration here: expected one that has, '
-            'such as two_step')
+            f'shaper {best.shaper} does not end this move in a finite time: expected one that '
+            'does, such as two_step')
     if slew_limits is None:
         slew_limits = _series(swing / fastest)
     rows = [_row(best, best, math.inf, math.inf, coil)]

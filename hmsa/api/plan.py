@@ -112,7 +112,7 @@ class Plan:
 
     @property
     def flux_density_rate(self) -> float:
-        """Largest change from a level to the next over the time of the former, in T/s."""
+        """Largest difference of successive levels over the duration of the first one, in T/s."""
         steps = np.abs(np.diff(self.flux_densities)) / np.diff(self.times)
         return float(np.max(steps, initial=0.0))
 

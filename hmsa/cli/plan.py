@@ -66,9 +66,9 @@ def add_parser(subparsers: Any) -> None:
          'two_step (default), robust, minimax, minimum_time, modal, smooth, step, zv, zvd, ei or '
          'umzv'),
         ('--order', 'N', int,
-         'order of robust, a cascade of N two-step commands, and of minimax, which takes as long; '
-         'half periods that modal takes for a block with modes; for a beam, each above 2 adds '
-         'half a period (default 2)',
+         'order of a shaper (default 2). robust: a cascade of N two-step commands; minimax: as '
+         'long as robust; modal: N half periods for a block with modes, and half a period more '
+         'for each order above 2 for a beam',
          {'default': 2}),
         ('--errors', 'G,C,J', str,
          'relative errors in shear modulus, damping and J_lim that minimax must tolerate (default '
@@ -77,13 +77,13 @@ def add_parser(subparsers: Any) -> None:
         ('--periods', 'N', float,
          'minimum duration of a smooth move in natural periods (default 1)',
          {'default': 1.0}),
-        ('--max-rate', 'R', float, 'maximum stretch rate of a smooth move (default any)',
+        ('--max-rate', 'R', float, 'maximum stretch rate of a smooth move (default unlimited)',
          {'default': math.inf}),
         ('--params-file', 'YAML', Path,
          'parameter file (YAML) of planner and plant, for a plan in seconds and tesla'),
         temperature_option(
             'with --params-file: temperature of block and coil in degrees Celsius; the file has '
-            'the coefficients, thermal.* (default: that at which its values hold)'),
+            'the coefficients, thermal.* (default: its thermal.reference)'),
         of_unit('--tesla-per-ampere', 'T/A', 'field of the coil per current, for levels in A'),
         ('--amplifier',
          'with --params-file: also compare the move times and flux densities of amplifiers from '

@@ -40,7 +40,7 @@ class Known:
                 not np.allclose(matrix, matrix.T, 1e-6, 0.0)
                 or np.min(np.linalg.eigvalsh(matrix / np.outer(scale, scale))) < _SINGULAR):
             raise BadInputError(
-                f'{PREFIX}covariance is not one: expected a symmetric matrix with positive '
+                f'{PREFIX}covariance is not a covariance matrix: expected a symmetric one with positive '
                 'eigenvalues, row after row')
 
     @classmethod

@@ -137,10 +137,9 @@ class Measurement:
         clipped, repeated = self._flat()
         if repeated:
             raise BadInputError(
-                f'the {self.coordinate.name} of {self.label} is a staircase: in motion most '
-                f'values come {repeated} times, as where a sensor is read more often than it '
-                'measures, or measures in batches; expected each measurement once, with its '
-                'timestamp')
+                f'the {self.coordinate.name} of {self.label} is a staircase: during motion, '
+                f'most values occur {repeated} times, as if the sensor were read more often than '
+                'it measures; expected each measurement once, with its timestamp')
         if clipped:
             raise BadInputError(
                 f'the {self.coordinate.name} of {self.label} is cut off {clipped} times at '

@@ -187,7 +187,7 @@ def free_of(
     without = {x[1:] for x in names if x[0] == '-'}
     if missing := sorted(without.difference(free)):
         raise BadInputError(
-            f'--free=-{missing[0]} takes away a parameter that is not free: expected one of '
+            f'--free=-{missing[0]} removes a parameter that is not free: expected one of '
             f'{", ".join(free)}')
     return check_free((x for x in free if x not in without), law)
 

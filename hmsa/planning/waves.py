@@ -72,8 +72,8 @@ def sampled_shape(times: Array, stretches: Array) -> Shape:
     size = float(np.ptp(stretches))
     if not size > 0.0 or abs(stretches[-1] - stretches[0]) > 1e-6 * size:
         raise BadInputError(
-            f'a wave from {stretches[0]:g} to {stretches[-1]:g}: expected one period, of which '
-            'the last sample repeats the first, and which is not constant')
+            f'the period of the wave goes from {stretches[0]:g} to {stretches[-1]:g}: expected '
+            'stretches that vary, and a last sample equal to the first')
     spans = (times - times[0]) / (times[-1] - times[0])
     values = np.append(stretches[:-1], stretches[0])
     spline = CubicSpline(spans, values, bc_type='periodic')

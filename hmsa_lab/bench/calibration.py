@@ -301,6 +301,6 @@ def scale_by_gauge(
     rest = float(np.mean(length[still])) if np.any(still) else math.nan
     if not rest > 0.0 or misses > 0.5:
         raise BadInputError(
-            f'the gauge shows {rest:g} without a field, and misses a straight line by '
+            f'the gauge reads {rest:g} without a field, and deviates from a straight line by '
             f'{100.0 * misses:.3g} % of its range: expected the length of the actuator')
     return SensorScale(gain, offset, rest, scale.latency), misses

@@ -97,11 +97,11 @@ class Follower:
 
     def reset(self) -> str:
         """Discard the estimates and return a confirmation; raise `BadInputError` if off."""
-        raise BadInputError('feedback is off and nothing is learnt: expected observe or adapt')
+        raise BadInputError('feedback is off, so there is no estimate: expected observe, adapt or cautious')
 
     def save(self, *, by_joint: bool) -> str:
         """Write the estimates to a file and return a confirmation; `BadInputError` if off."""
-        raise BadInputError('feedback is off and nothing is learnt: expected observe or adapt')
+        raise BadInputError('feedback is off, so there is no estimate: expected observe, adapt or cautious')
 
 
 def feedback(

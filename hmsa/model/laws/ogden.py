@@ -18,7 +18,8 @@ def _scaled(values: Mapping[str, Any]) -> tuple[float, Elastic]:
             f'{TERMS} of both for law {LAW.name}')
     if 0.0 in alpha:
         raise BadInputError(
-            f'parameter law.alpha is {excerpt(list(alpha))}: expected no 0, which has no energy')
+            f'parameter law.alpha is {excerpt(list(alpha))}: expected no 0, since such a term '
+            'stores no energy')
     pairs = tuple(zip(mu, alpha, strict=True))
     modulus = positive_modulus(
         LAW.name, 0.5 * sum(m * a for m, a in pairs), 'sum mu alpha/2', (list(mu), list(alpha)))
