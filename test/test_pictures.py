@@ -214,7 +214,7 @@ def test_a_column_of_a_journal_has_room_for_the_caption(tmp_path: Path) -> None:
     assert [x.get_xlabel() for x in columns['other'].axes] == [
         r'stretch $\lambda$', 'setpoint']
     # The plan is what happened, so that there is no difference to draw.
-    with pytest.raises(BadInputError, match='nothing to draw in the panel plan: expected'):
+    with pytest.raises(BadInputError, match='panel plan of .* would be empty: expected'):
         draw([], [run], Paper(panels=['response', 'plan']))
     with pytest.raises(BadInputError, match="panel is 'side': expected one of command, resp"):
         Paper(panels=['side'])
