@@ -242,9 +242,8 @@ def draw(path: Path, found: Mapping[int, Mapping[str, Sequence[Left]]]) -> None:
                 color=color, markersize=3, alpha=0.6, label='' if place else way)
     axes.axhline(100.0 * WORSE, color='0.3', linewidth=0.8, linestyle='--')
     axes.set_yscale('symlog', linthresh=1.0)
-    axes.set_xticks(range(len(groups)), [
-        x.replace('change of ', 'change:\n').replace(' of ', '\nof ', 1) for x in groups],
-        rotation=30, ha='right')
-    axes.set_ylabel('left more than in open loop,\n% of the step')
+    axes.set_xticks(range(len(groups)), list(groups), rotation=40, ha='right',
+                    rotation_mode='anchor')
+    axes.set_ylabel('error beyond that of open loop\n(% of the step)')
     figure.legend(loc='outside upper right', ncols=2)
     figure.savefig(path, metadata={'Software': None})

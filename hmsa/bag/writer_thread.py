@@ -176,8 +176,8 @@ class WriterThread:
     def snapshot(self) -> str:
         """Write the messages kept in memory; raise `BagError` if not in snapshot mode."""
         if not self._limits.snapshot_ns:
-            raise BagError('a snapshot needs snapshot mode: now every message is recorded; expected '
-                           'record.snapshot_mode: true')
+            raise BagError('a snapshot needs snapshot mode, and every message is recorded: '
+                           'expected record.snapshot_mode: true')
         with self._condition:
             oldest = self._kept[-1].messages[-1][1] - self._limits.snapshot_ns if self._kept else 0
             count = 0

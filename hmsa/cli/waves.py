@@ -94,8 +94,8 @@ def _write_path(arguments: argparse.Namespace, actuator: 'Actuator', shape: Any)
 
     if shape == 'square':
         raise BadInputError(
-            'a square wave is not a path, because it jumps: expected --out FILE for its levels, or '
-            'its extremes as setpoints of hmsa run, which feedback corrects one by one')
+            'a square wave is not a path, because it jumps: expected --out FILE for its levels, '
+            'or its extremes as setpoints of hmsa run, which feedback corrects one by one')
     first, last = arguments.frequency, arguments.to
     path = wave_path(
         actuator, wave_of(actuator, shape, arguments.amplitude, arguments.offset),

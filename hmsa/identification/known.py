@@ -40,8 +40,8 @@ class Known:
                 not np.allclose(matrix, matrix.T, 1e-6, 0.0)
                 or np.min(np.linalg.eigvalsh(matrix / np.outer(scale, scale))) < _SINGULAR):
             raise BadInputError(
-                f'{PREFIX}covariance is not a covariance matrix: expected a symmetric one with positive '
-                'eigenvalues, row after row')
+                f'{PREFIX}covariance is not a covariance matrix: expected a symmetric one with '
+                'positive eigenvalues, row after row')
 
     @classmethod
     def read(cls, settings: Mapping[str, Any]) -> 'Known':

@@ -47,8 +47,9 @@ def draw(
     for name in paper.panels:
         if not panels[name]:
             raise BadInputError(
-                f'panel {name} of {", ".join(x.run.label for x in parts)} would be empty: expected '
-                'setpoints, a plan that differs from the run, or times that vary; leave it out')
+                f'panel {name} of {", ".join(x.run.label for x in parts)} would be empty: '
+                'expected setpoints, a plan that differs from the run, or times that vary; leave '
+                'it out')
     return style.sheet(paths, _arranged(panels, columns), paper)
 
 

@@ -13,6 +13,8 @@ from hmsa.plugins import FOLLOWER, registered
 from hmsa_ros.runtime.planning_task import Drafts, PlanningTask
 from hmsa_ros.runtime.records import Clock, Output, Samples, Settings, Verdict
 
+_OFF = 'feedback is off, so there is no estimate: expected observe, adapt or cautious'
+
 
 class Follower:
     """
@@ -97,11 +99,11 @@ class Follower:
 
     def reset(self) -> str:
         """Discard the estimates and return a confirmation; raise `BadInputError` if off."""
-        raise BadInputError('feedback is off, so there is no estimate: expected observe, adapt or cautious')
+        raise BadInputError(_OFF)
 
     def save(self, *, by_joint: bool) -> str:
         """Write the estimates to a file and return a confirmation; `BadInputError` if off."""
-        raise BadInputError('feedback is off, so there is no estimate: expected observe, adapt or cautious')
+        raise BadInputError(_OFF)
 
 
 def feedback(
