@@ -9,7 +9,7 @@ import sys
 import textwrap
 from typing import Any, overload, SupportsIndex
 
-from hmsa.errors import BadInputError, meant
+from hmsa.errors import BadInputError, check_choice
 
 #: Heading of the standard deviation of the column before.
 DEVIATION = '±'
@@ -95,10 +95,7 @@ class Table:
         if isinstance(key, SupportsIndex):
             return self.records()[key]
         names = [x.name for x in self.columns]
-        if key not in names:
-            raise BadInputError(
-                f'the table has no column {key!r}: expected one of {", ".join(names)}'
-                + meant(key, names))
+        check_choice('a column of the table', key, names)
         return [row[names.index(key)] for row in self.rows]
 
     def __repr__(self) -> str:

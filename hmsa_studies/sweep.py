@@ -121,9 +121,7 @@ class Sweep:
         self._sampled = len(self._axes) - 1 if samples else None
         seen = [name for axis in self._axes for name in axis] + list(grids)
         for name in seen:
-            if name not in ranges:
-                raise BadInputError(
-                    f'column {name!r} is unknown: expected some of {", ".join(ranges)}')
+            check_choice('a column', name, ranges)
             if seen.count(name) > 1:
                 raise BadInputError(
                     f'{name} is a column of the cases or samples and has other values: expected '

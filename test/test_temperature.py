@@ -122,7 +122,7 @@ def test_temperature_of_an_actuator_without_coefficients_is_refused():
 
 @pytest.mark.parametrize(('thermal', 'words'), [
     ({'shear_modulus': 0.3}, r'thermal.shear_modulus is 0.3.*-0.1 to 0.1'),
-    ({'remanance': -1e-3}, "thermal has 'remanance'.*did you mean remanence"),
+    ({'remanance': -1e-3}, "coefficient is 'remanance'.*did you mean remanence"),
     ({'reference': 298.15}, 'thermal.reference is 298.15.*not kelvin|thermal.reference'),
     ({'rise': -1.0}, 'thermal.rise'), (3e-3, 'thermal coefficients are 0.003')])
 def test_impossible_coefficient_is_refused(thermal, words):

@@ -26,7 +26,7 @@ from hmsa.api.arguments import (
 )
 from hmsa.api.doubts import unquestioned, warn
 from hmsa.api.mounting import facts, further_facts, with_mount
-from hmsa.errors import assume, BadInputError, meant, UnusualWarning
+from hmsa.errors import assume, BadInputError, check_choice, UnusualWarning
 from hmsa.files import write_text, yaml_text
 from hmsa.interfaces.actuator import actuator_from, model_from, parameters_of
 from hmsa.interfaces.parameters import (
@@ -415,11 +415,8 @@ class Actuator:
         50.0
 
         """
-        unknown = [x for x in parameters if x not in _KEYS]
-        if unknown:
-            raise BadInputError(
-                f'{unknown[0]} is no parameter of an actuator: expected {", ".join(_KEYS)}'
-                + meant(unknown[0], _KEYS))
+        for name in parameters:
+            check_choice('a parameter to replace', name, _KEYS)
         mount = parameters.pop('mount', 'paper')
         changed = parameters_in(parameters, self.law)
         # A new model, new branches or coefficients replace all previous ones.
@@ -464,11 +461,8 @@ class Actuator:
         12000.0
 
         """
-        unknown = [x for x in factors if x not in ACTUATOR_FIELDS]
-        if unknown:
-            raise BadInputError(
-                f'{unknown[0]} has no factor: expected {", ".join(ACTUATOR_FIELDS)}'
-                + meant(unknown[0], ACTUATOR_FIELDS))
+        for name in factors:
+            check_choice('a parameter to scale', name, ACTUATOR_FIELDS)
         block = actuator_from(_checked(self.parameters) | {
             f'mismatch.{name}': number(x, f'the factor on {name}') for name, x in factors.items()})
         return self._of(JointModel(replace(block, creep=self.block.creep), self.model.options))

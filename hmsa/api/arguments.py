@@ -333,10 +333,7 @@ def _thermal_values(thermal: Any) -> dict[str, Any]:
     known = {x.name.partition('.')[2]: x for x in THERMAL}
     values = {}
     for name, value in mapping_of(thermal, 'thermal coefficients', "'remanence': -1e-3").items():
-        if name not in known:
-            raise BadInputError(
-                f'thermal has {excerpt(name)}: expected some of {", ".join(known)}'
-                + meant(str(name), known))
+        check_choice('a thermal coefficient', name, known)
         values[known[name].name] = number(value, f'thermal {name}', known[name].unit)
     return values
 

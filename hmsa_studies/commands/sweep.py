@@ -22,7 +22,7 @@ from typing import Any, TYPE_CHECKING
 from hmsa.cli.options import add_command, MATERIAL
 from hmsa.cli.pictures import formats_of, paper_of, picture_options
 from hmsa.cli.terminal import progress
-from hmsa.errors import BadInputError
+from hmsa.errors import BadInputError, check_choice
 from hmsa.report.paper import named, Paper
 from hmsa_studies.commands import chunked
 
@@ -112,10 +112,8 @@ class _SweepPicture:
         self._added = 0
         self._paths: list[Path] = arguments.picture
         names = list(sweep.shown) if arguments.show is None else _names(arguments.show)
-        wrong = [x for x in names if x not in sweep.results]
-        if wrong:
-            raise BadInputError(
-                f'--show has {wrong[0]!r}: expected some of {", ".join(sweep.results)}')
+        for name in names:
+            check_choice('--show', name, sweep.results)
         out: Path | None = arguments.out
         self._paper = paper_of(
             arguments, None if out is None or _is_folder(out) else out,
