@@ -8,6 +8,7 @@ entry point therefore installs handlers for all three before it imports slow mod
 that needs to clean up only records signals, and checks them where it is safe to end.
 """
 
+import atexit
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 import gc
@@ -33,6 +34,7 @@ class Ending:
         """Leave the signal handlers unchanged."""
         self.asked = False
         self.status = 128 + signal.SIGINT
+        self._last: int | None = None
         self._respond: Callable[[], object] | None = None
 
     def leave(self, status: int | None = None, text: str = '') -> None:
@@ -82,7 +84,7 @@ class Ending:
 
     def finish(self, status: int) -> None:
         """
-        End the process with a status soon, even if a library blocks in its clean-up.
+        End the process with a status as soon as Python ends, even if a library blocks before.
 
         Fast DDS 2.14 may never return from the deletion of a participant: it waits, while holding
         a lock, for a thread that has just received the end of another participant.
@@ -93,6 +95,23 @@ class Ending:
             # Python, where Fast DDS deletes it while a thread may still read from it.
             gc.unfreeze()
             gc.collect()
+        self._last = status
+
+    def quit(self) -> None:
+        """
+        End the process now if it is finished; called where Python ends.
+
+        Python would take longer to take all modules apart than a short command takes in all.
+        """
+        if self._last is not None:
+            for stream in filter(None, (sys.stdout, sys.stderr)):
+                with suppress(OSError, ValueError):  # nobody reads it any more
+                    stream.flush()
+            if 'rclpy' in sys.modules:
+                # Libraries buffer lines of their own.
+                import ctypes
+                ctypes.CDLL(None).fflush(None)
+            os._exit(self._last)
 
     def check(self) -> None:
         """Raise KeyboardInterrupt if the end was requested."""
@@ -154,3 +173,5 @@ class Deadline:
 
 #: The ending of this process.
 ENDING = Ending()
+# First, and so called last of all.
+atexit.register(ENDING.quit)

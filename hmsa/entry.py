@@ -22,6 +22,8 @@ def main(argv: list[str] | None = None) -> int:
     from hmsa.cli import main as command
     try:
         status = command(argv)
+    except SystemExit as end:  # of argparse
+        status = int(end.code or 0)
     finally:
         # Signals during the shutdown of Python, which takes a while, would end it immediately.
         ENDING.ignore()

@@ -75,6 +75,19 @@ ending._LAST_SECONDS = 1
 atexit.register(ctypes.PyDLL(None).pause)
 sys.exit(entry.main({arguments!r}))
 """
+# Python is not taken apart, but what is registered for its end is done, and lines are written.
+AT_EXIT = """
+import atexit, ctypes, sys
+from hmsa import ending, entry
+class Held:
+    def __del__(self):
+        print('taken apart')
+held = Held()
+atexit.register(print, 'at exit')
+sys.modules['rclpy'] = None
+ctypes.CDLL(None).printf(b'of a library')
+sys.exit(entry.main({arguments!r}))
+"""
 # A call that returns when a line comes, and may take half a second.
 IN_A_CALL = """
 import sys
@@ -113,6 +126,17 @@ def test_a_process_ends_even_where_a_library_does_not(arguments, status):
     assert done.returncode == status
     assert ('error' in done.stderr) == bool(status)
     assert ('1.1' in done.stdout) == (not status)
+
+
+@pytest.mark.parametrize(('arguments', 'status'), [(['--version'], 0), (['plan', '0'], 2)])
+def test_a_process_does_not_wait_until_python_has_taken_itself_apart(arguments, status):
+    done = subprocess.run(
+        [sys.executable, '-c', AT_EXIT.format(arguments=arguments)], capture_output=True,
+        text=True, check=False, timeout=60)
+    assert done.returncode == status
+    assert 'at exit' in done.stdout
+    assert 'of a library' in done.stdout
+    assert 'taken apart' not in done.stdout
 
 
 def test_time_in_which_a_process_is_stopped_does_not_count_for_a_call():
