@@ -143,6 +143,9 @@ def parameters(**nodes):
             **{f'actuator.{x}': getattr(actuator, x) for x in ACTUATOR_FIELDS}}.items()}
 
 
+KNOWN = parameters(planner=ACTUATOR, plant=ACTUATOR)
+
+
 @cache
 def of_the_paper():
     """Return the messages of the paper's sequence, which must not be modified."""
@@ -233,8 +236,7 @@ def bag(tmp_path_factory):
     """Return the bag of the paper's sequence."""
     lost = {'/joint_states': 0, '/flux_density_command': 2}
     return write(
-        tmp_path_factory.mktemp('report') / 'run', simulated(),
-        **parameters(planner=ACTUATOR, plant=ACTUATOR), lost=json.dumps(lost))
+        tmp_path_factory.mktemp('report') / 'run', simulated(), **KNOWN, lost=json.dumps(lost))
 
 
 def parts_of(*bags, **options):
@@ -252,9 +254,7 @@ def test_a_path_is_one_setpoint_which_is_judged_from_its_end_on(tmp_path):
     end = 40_000_000
     path = [((1.0 + 0.2 * x * x * (3.0 - 2.0 * x), 1.2 * x * (1.0 - x) / 0.04, math.nan),
              round(x * end)) for x in np.linspace(0.0, 1.0, 9).tolist()]
-    part = one(
-        tmp_path / 'run', simulated(path=path, extra=0.1),
-        **parameters(planner=ACTUATOR, plant=ACTUATOR))
+    part = one(tmp_path / 'run', simulated(path=path, extra=0.1), **KNOWN)
     finding, = part.evaluation.findings
     assert (str(finding.verdict), finding.setpoint.target) == ('arrived', 1.2)
     assert finding.setpoint.arrival == START + LEAD + end
@@ -367,9 +367,7 @@ def test_setpoints_are_found_and_measured_as_the_demo_measures_them(bag):
 
 @pytest.mark.parametrize('shaper', ['robust', 'minimax', 'minimum_time', 'smooth', 'zv', 'step'])
 def test_setpoints_are_found_whatever_the_shaper(tmp_path, shaper):
-    part = one(
-        tmp_path / 'bag', simulated(shaper=shaper),
-        **parameters(planner=ACTUATOR, plant=ACTUATOR))
+    part = one(tmp_path / 'bag', simulated(shaper=shaper), **KNOWN)
     assert [x.stretch for x in part.evaluation.results] == [1.1, 1.2, 1.4]
     residual = max(x.residual for x in part.evaluation.results)
     if shaper in ('robust', 'minimum_time', 'smooth'):
@@ -385,7 +383,7 @@ def test_plain_steps_and_predictions_are_those_of_a_creeping_block_and_its_ramps
     told = {f'{node}.viscoelastic.{name}': json.dumps(list(values)) for node in (
         'planner', 'plant') for name, values in (('ratio', creep.ratios), ('time', creep.times))}
     bag = tmp_path / 'bag'
-    part = one(bag, simulated(creep=creep), **parameters(planner=ACTUATOR, plant=ACTUATOR), **told)
+    part = one(bag, simulated(creep=creep), **KNOWN, **told)
     found, run = part.evaluation, part.run
     known = np.isfinite(found.planned.at(found.time).stretch)
     assert np.max(np.abs(found.planned.at(found.time).stretch - run.stretch)[known]) < 1e-6
@@ -420,7 +418,7 @@ def test_the_page_of_a_beam_speaks_of_its_deflection(tmp_path):
 
 def test_without_outcomes_setpoints_are_told_by_the_levels_that_last(tmp_path, bag):
     messages = without(simulated(), 'joint_trajectory', 'status', 'plan', 'outcomes')
-    part = one(tmp_path / 'bag', messages, **parameters(planner=ACTUATOR, plant=ACTUATOR))
+    part = one(tmp_path / 'bag', messages, **KNOWN)
     expected, = parts_of(bag)
     for ours, theirs in zip(
             part.evaluation.results, expected.evaluation.results, strict=True):
@@ -481,7 +479,7 @@ def test_a_block_that_did_not_move_has_no_residual(tmp_path):
     stuck = [(time, topic, kind, joint_state(time, 1.0, 0.0, 0.0)
               if topic == '/joint_states' else message)
              for time, topic, kind, message in simulated()]
-    part = one(tmp_path / 'bag', stuck, **parameters(planner=ACTUATOR, plant=ACTUATOR))
+    part = one(tmp_path / 'bag', stuck, **KNOWN)
     assert [(x.moved, math.isnan(x.residual)) for x in part.evaluation.results] == [
         (False, True)] * 3
     report = Page(page([part]))
@@ -550,7 +548,7 @@ def test_commands_on_another_clock_than_the_samples_hold_up_no_report(tmp_path):
     messages = [
         x if x[1] != '/joint_states' else (*x[:3], joint_state(
             x[0] + ahead, x[3].position, x[3].velocity, x[3].effort)) for x in simulated()]
-    part = one(tmp_path / 'bag', messages, **parameters(planner=ACTUATOR, plant=ACTUATOR))
+    part = one(tmp_path / 'bag', messages, **KNOWN)
     assert not np.isfinite(part.evaluation.plain.stretch).any()
     assert not np.isfinite(part.evaluation.planned.stretch).any()
     page([part])
@@ -574,8 +572,7 @@ def test_commands_that_are_repeated_change_nothing_but_their_number(tmp_path, ba
             repeats.append((time, *due[-1][1:3], command(
                 time + LEAD, due[-1][3].magnetic_field.z)))
     assert len(repeats) > 8
-    part = one(
-        tmp_path / 'bag', messages + repeats, **parameters(planner=ACTUATOR, plant=ACTUATOR))
+    part = one(tmp_path / 'bag', messages + repeats, **KNOWN)
     expected, = parts_of(bag)
     # As text: NaN, where nothing is predicted, is not equal to itself.
     assert str(part.evaluation.levels) == str(expected.evaluation.levels)
@@ -600,9 +597,7 @@ def test_what_replaces_later_levels_is_no_repeat():
 @pytest.mark.parametrize('late', [0, 3_000_000])
 def test_lateness_is_told_by_what_took_effect(tmp_path, late):
     messages = simulated()
-    part = one(
-        tmp_path / 'bag', messages + applied(messages, late),
-        **parameters(planner=ACTUATOR, plant=ACTUATOR))
+    part = one(tmp_path / 'bag', messages + applied(messages, late), **KNOWN)
     assert part.timing.lateness == pytest.approx([late / NANOSECONDS] * 6)
     assert part.timing.late == (6 if late else 0)
     assert part.timing.unapplied == 0
@@ -634,8 +629,7 @@ def test_a_recording_that_begins_while_the_field_is_on_is_verified(tmp_path):
     late = [x for x in messages if x[0] >= begin] + [
         (max(at, begin), '/flux_density_applied', TYPES[APPLIED], command(at, value))
         for at, value in applied]
-    found, = verify(write(
-        tmp_path / 'bag', late, **parameters(planner=ACTUATOR, plant=ACTUATOR)))
+    found, = verify(write(tmp_path / 'bag', late, **KNOWN))
     assert found.largest_difference < SAME
     assert found.unapplied_count == 0
     assert level_results(read_runs(tmp_path / 'bag')[0])[0].duration < 1.0
@@ -647,7 +641,7 @@ def test_levels_that_the_recorder_lost_are_those_of_the_commands(tmp_path):
     del reported[3:5]
     part = one(
         tmp_path / 'bag', messages + reported, lost=json.dumps({'/flux_density_applied': 2}),
-        **parameters(planner=ACTUATOR, plant=ACTUATOR))
+        **KNOWN)
     assert [(x.stamp, x.flux_density) for x in part.run.levels] == [
         (x.stamp, x.flux_density) for x in part.run.commands]
     assert 'lost 2 of /flux_density_applied' in ' '.join(part.run.notes)
@@ -690,8 +684,7 @@ def of_several_joints(names, plants):
 def test_each_joint_of_a_planner_of_several_is_a_run(tmp_path, bag):
     other = replace(ACTUATOR, density=2100.0)
     folder = write(
-        tmp_path / 'bag', of_several_joints(('left', 'right'), (ACTUATOR, other)),
-        **parameters(planner=ACTUATOR, plant=ACTUATOR),
+        tmp_path / 'bag', of_several_joints(('left', 'right'), (ACTUATOR, other)), **KNOWN,
         **{'plant.right.actuator.density': '2100.0', 'plant.left.actuator.density': 'null'})
     left, right = parts_of(folder)
     assert (left.run.label, right.run.label) == ('bag left', 'bag right')
@@ -818,7 +811,7 @@ def test_broken_samples_and_commands_are_left_out_and_told(tmp_path):
 
 def test_garbage_among_the_messages_does_not_spoil_the_rest(tmp_path):
     messages = simulated()
-    clean = one(tmp_path / 'clean', messages, **parameters(planner=ACTUATOR, plant=ACTUATOR))
+    clean = one(tmp_path / 'clean', messages, **KNOWN)
     names = {topic: kind for _, topic, kind, _ in messages}
     late = messages[-1][0] + 1
     strange = [(late, topic, kind, payload(message, kind)[:-9]) for topic, kind, message in (
@@ -830,8 +823,7 @@ def test_garbage_among_the_messages_does_not_spoil_the_rest(tmp_path):
     # Long before all others, it supersedes nothing; nobody can be at these stretches.
     strange += [(START - 1, '/planner/plan', TYPES[PLAN], trajectory(START - 5, [
         (0, -1e300, 0.0, 0.0), (1, 1e-320, 0.0, 0.0)]))]
-    part = one(tmp_path / 'bag', messages + strange,
-               **parameters(planner=ACTUATOR, plant=ACTUATOR))
+    part = one(tmp_path / 'bag', messages + strange, **KNOWN)
     assert asdict(part.evaluation.results[1]) == pytest.approx(
         asdict(clean.evaluation.results[1]), rel=1e-9, abs=1e-12)
     assert len(part.run.time) == len(clean.run.time) + 1
@@ -859,8 +851,7 @@ def test_a_plan_without_a_point_is_no_plan(tmp_path):
 def test_a_slew_limit_that_is_none_is_not_taken_for_one(tmp_path, text, reached):
     # Without outcomes, the arrival includes the ramp.
     part = one(
-        tmp_path / 'bag', without(simulated(), 'outcomes'),
-        **parameters(planner=ACTUATOR, plant=ACTUATOR), **{'plant.slew_limit': text})
+        tmp_path / 'bag', without(simulated(), 'outcomes'), **KNOWN, **{'plant.slew_limit': text})
     assert [x.stretch for x in part.evaluation.results] == reached
     assert Page(page([part])).ids
 
@@ -912,7 +903,7 @@ def test_a_run_without_commands_shows_the_response_alone(tmp_path):
 
 def test_a_move_that_the_recording_cut_off_is_left_out(tmp_path):
     messages = [x for x in simulated() if x[0] < START + LEAD + round(0.088 * NANOSECONDS)]
-    part = one(tmp_path / 'bag', messages, **parameters(planner=ACTUATOR, plant=ACTUATOR))
+    part = one(tmp_path / 'bag', messages, **KNOWN)
     assert [x.stretch for x in part.evaluation.results] == [1.1, 1.2]
 
 
@@ -934,9 +925,7 @@ def test_an_outcome_that_no_planner_publishes_is_told_and_hides_no_setpoint(tmp_
     messages = simulated()
     told = next(x for x in messages if x[1].endswith('outcomes'))
     values = {x.key: x.value for x in told[3].values} | change
-    part = one(
-        tmp_path / 'bag', [*messages, (*told[:3], diagnostic(0, '', values))],
-        **parameters(planner=ACTUATOR, plant=ACTUATOR))
+    part = one(tmp_path / 'bag', [*messages, (*told[:3], diagnostic(0, '', values))], **KNOWN)
     assert [x.stretch for x in part.evaluation.results] == [1.1, 1.2, 1.4]
     assert sum('topic /planner/outcomes is not as' in x for x in part.run.notes) == 1
 
@@ -957,8 +946,7 @@ def test_the_findings_of_a_run_are_those_of_its_planner(tmp_path):
     part = one(
         tmp_path / 'bag', [*without(messages, 'outcomes'), *(
             (START + i, '/planner/outcomes', TYPES[OUTCOMES], diagnostic(0, 'it rings', {
-                **told, **x})) for i, x in enumerate(changes))],
-        **parameters(planner=ACTUATOR, plant=ACTUATOR))
+                **told, **x})) for i, x in enumerate(changes))], **KNOWN)
     finding, = part.evaluation.findings
     assert (str(finding.verdict), finding.message, finding.samples, finding.vibration) == (
         'vibrating', 'it rings', 40, 0.0125)
@@ -977,8 +965,7 @@ def test_a_replaced_setpoint_is_measured_until_the_next_begins(tmp_path):
     part = one(
         tmp_path / 'bag', [*(x for x in messages if x is not told[0]), (
             *told[0][:3], diagnostic(0, '', {**values, 'ended': 'replaced', 'until': until,
-                                             'verdict': 'arrived', 'samples': '9'}))],
-        **parameters(planner=ACTUATOR, plant=ACTUATOR))
+                                             'verdict': 'arrived', 'samples': '9'}))], **KNOWN)
     assert [x.stretch for x in part.evaluation.results] == [1.1, 1.2, 1.4]
     assert max(x.error for x in part.evaluation.results) < ROUNDING
 
@@ -999,8 +986,7 @@ def test_levels_that_begin_at_rest_give_no_setpoint_of_noise(tmp_path, measured)
             x.header = header(
                 x.header.stamp.sec * NANOSECONDS + x.header.stamp.nanosec + pause)
     rest = (first, '/flux_density_command', TYPES[COMMAND], command(first + LEAD, 0.0))
-    part = one(tmp_path / 'bag', [rest, *messages],
-               **parameters(planner=ACTUATOR, plant=ACTUATOR))
+    part = one(tmp_path / 'bag', [rest, *messages], **KNOWN)
     assert [x.setpoint.target for x in part.evaluation.findings] == pytest.approx(
         [1.2, 1.0], abs=1e-6)
 
@@ -1015,7 +1001,7 @@ def test_odd_recordings_are_shown_for_what_they_are(tmp_path, samples, levels, s
     if not levels:
         messages.append(
             (START, '/flux_density_command', TYPES[COMMAND], command(START, math.inf)))
-    part = one(tmp_path / 'bag', messages, **parameters(planner=ACTUATOR, plant=ACTUATOR))
+    part = one(tmp_path / 'bag', messages, **KNOWN)
     assert len(part.evaluation.results) == setpoints
     report = Page(page([part]))
     assert len(report.curve('response', 'simulated')['y']) == samples
@@ -1189,8 +1175,7 @@ def test_several_bags_lie_over_each_other_in_colours_of_their_own(tmp_path, bag)
 
 def test_block_of_the_plant_is_the_one_that_a_mismatch_leaves(tmp_path):
     run, = read_runs(write(
-        tmp_path / 'run', simulated(plant=replace(ACTUATOR, density=2100.0)),
-        **parameters(planner=ACTUATOR, plant=ACTUATOR),
+        tmp_path / 'run', simulated(plant=replace(ACTUATOR, density=2100.0)), **KNOWN,
         **{'plant.mismatch.density': json.dumps(2100.0 / ACTUATOR.density)}))
     assert run.plant.density == pytest.approx(2100.0, rel=1e-12)
     assert any('different parameters' in x for x in run.notes)
@@ -1236,9 +1221,7 @@ def test_thinning_out_takes_any_number_of_points(count):
 
 def test_of_many_arrivals_the_worst_are_shown_and_the_table_has_all(tmp_path):
     sequence = tuple((1.1 if i % 2 else 1.2, 8.0) for i in range(20))
-    part = one(
-        tmp_path / 'bag', simulated(sequence, period=200_000, noise=1e-5),
-        **parameters(planner=ACTUATOR, plant=ACTUATOR))
+    part = one(tmp_path / 'bag', simulated(sequence, period=200_000, noise=1e-5), **KNOWN)
     report = Page(page([part]))
     shown = sorted(int(x.removeprefix('arrival')) for x in report.figures
                    if x.startswith('arrival'))
@@ -1289,8 +1272,7 @@ def rounded(messages):
 def test_levels_that_hardware_rounds_reach_the_setpoints_that_were_requested(tmp_path, missing):
     targets = 1.1, 1.2, 1.21, 1.4, 1.2, 1.1, 1.05, 1.0
     part = one(tmp_path / 'bag', without(
-        rounded(simulated([(x, 40.0) for x in targets], period=500_000)), *missing),
-        **parameters(planner=ACTUATOR, plant=ACTUATOR))
+        rounded(simulated([(x, 40.0) for x in targets], period=500_000)), *missing), **KNOWN)
     found = part.evaluation.findings
     assert [(x.setpoint.number, x.setpoint.target, x.verdict) for x in found] == [
         (i, x, 'arrived') for i, x in enumerate(targets, 1)]
