@@ -23,7 +23,7 @@ from hmsa.bag.definitions import message_definition
 from hmsa.bag.writer import BagTopic, BagWriter
 from hmsa.cli import main
 from hmsa.errors import BadInputError
-from hmsa.identification.runs import recording_of
+from hmsa.identification.measurement import recording_of
 from hmsa.interfaces.actuator import parameters_of
 from hmsa.interfaces.outcome import Outcome
 from hmsa.interfaces.parameters import ACTUATOR_FIELDS

@@ -157,7 +157,8 @@ def _read(
     """Return the recording, prior knowledge with values of a bag, and whether there is any."""
     path: Path = arguments.recording
     if may_be_bag(path):
-        from hmsa.identification.runs import read_bag
+        from hmsa.identification.measurement import recording_of
+        from hmsa.runs.bags import read_run
 
         if arguments.commands is not None:
             raise BadInputError(
@@ -168,7 +169,8 @@ def _read(
                 f'--rest-length is given for the bag {path}: a bag contains stretches, to which '
                 'driver or sense node converts lengths; expected a CSV of lengths with it')
         given = belief.actuator if arguments.params_file is not None else None
-        recording, actuator, known = read_bag(path, joint=arguments.joint, actuator=given)
+        recording, actuator, known = recording_of(
+            read_run(path, joint=arguments.joint), given)
         if math.isfinite(recording.temperature):
             belief = belief.at_temperature(recording.temperature)
         return recording, replace(

@@ -22,10 +22,9 @@ from hmsa.identification.excitation import Bounds, excite
 from hmsa.identification.files import Belief, belief_in, file_text, read_belief
 from hmsa.identification.identify import identify
 from hmsa.identification.known import Known, PREFIX
-from hmsa.identification.measurement import Measurement
+from hmsa.identification.measurement import Measurement, recording_of
 from hmsa.identification.quantities import free_of
 from hmsa.identification.result import Identification
-from hmsa.identification.runs import recording_of
 from hmsa.interfaces.parameters import ACTUATOR_FIELDS
 from hmsa.interfaces.topics import PLANNER
 from hmsa.judge.records import worst
