@@ -171,10 +171,10 @@ def test_through_a_slow_coil_branches_are_integrated_as_exactly():
 @pytest.mark.parametrize(('ratio', 'time', 'sentence'), [
     ([0.1, 0.2], [1.0], 'ratio has 2 values and viscoelastic.time 1: expected one of each'),
     ([0.1] * 4, [1.0] * 4, 'have 4 values: expected at most 3 branches'),
-    ([-0.1], [1.0], 'viscoelastic.ratio has -0.1: expected 0 to 1000'),
-    ([math.nan], [1.0], 'viscoelastic.ratio has nan: expected 0 to 1000'),
-    ([0.1], [0.0], 'viscoelastic.time has 0 s: expected finite numbers above 0'),
-    ([0.1], [math.inf], 'viscoelastic.time has inf s: expected finite numbers above 0')])
+    ([-0.1], [1.0], 'viscoelastic.ratio is -0.1: expected 0 to 1000'),
+    ([math.nan], [1.0], 'viscoelastic.ratio is nan: expected 0 to 1000'),
+    ([0.1], [0.0], 'viscoelastic.time is 0 s: expected a finite number above 0'),
+    ([0.1], [math.inf], 'viscoelastic.time is inf s: expected a finite number above')])
 def test_branches_of_no_elastomer_are_refused_in_a_sentence(ratio, time, sentence):
     with pytest.raises(BadInputError) as refused:
         creep_from({'viscoelastic.ratio': ratio, 'viscoelastic.time': time})

@@ -161,7 +161,7 @@ def test_feedback_follows_what_such_a_branch_holds():
      'viscoelastic.stress has 0 values and viscoelastic.ratio 1: expected one of each for every '
      'branch with viscoelastic.flow power_law'),
     ({'viscoelastic.exponent': [0.5], 'viscoelastic.stress': [0.1]},
-     'viscoelastic.exponent has 0.5: expected 1 to 20'),
+     'viscoelastic.exponent is 0.5: expected 1 to 20'),
     ({'viscoelastic.flow': 'sinh'}, 'expected one of maxwell, power_law')])
 def test_a_flow_without_its_constants_is_refused_in_a_sentence(values, sentence):
     with pytest.raises(BadInputError) as refused:

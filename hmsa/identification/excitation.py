@@ -180,9 +180,8 @@ class Designer:
         self._values = quantities.values_of(actuator)
         self._group = actuator.nondimensional
         self.period = actuator.period
-        if not (rate > 0.0 and math.isfinite(rate) and noise > 0.0):
-            raise BadInputError(
-                f'rate is {rate:g} Hz and noise {noise:g}: expected finite numbers above 0')
+        check_number('rate', rate, 'Hz', above=0.0)
+        check_number('noise', noise, above=0.0)
         duration = _PERIODS * self.period if duration is None else duration
         if not (_SHORTEST + self._last) * self.period <= duration < math.inf:
             raise BadInputError(

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
-from hmsa.errors import BadInputError, check_choice
+from hmsa.errors import check_choice, check_number
 from hmsa.model import compressible, law
 from hmsa.model.equations import Array
 from hmsa.model.laws import elastica
@@ -341,10 +341,8 @@ def mounted(
 
     """
     check_mount(mount)
-    if not SHAPES[0] <= shape <= SHAPES[1]:
-        raise BadInputError(
-            f'half_thickness/half_length is {shape:g}: expected {SHAPES[0]:g} to '
-            f'{SHAPES[1]:g} for mount {mount}')
+    check_number(
+        f'with mount {mount} half_thickness/half_length', shape, least=SHAPES[0], most=SHAPES[1])
     found = spectrum(shape, mount, bulk_ratio=bulk_ratio)
     free = mount == 'free'
     # E/(3 G), and the transverse inertia.

@@ -1,10 +1,9 @@
 """Viscoelasticity: up to three branches in parallel with the hyperelastic model."""
 
 from dataclasses import dataclass, replace
-import math
 from typing import Any
 
-from hmsa.errors import BadInputError, check_choice
+from hmsa.errors import BadInputError, check_choice, check_number
 from hmsa.model.flows import FLOWS
 from hmsa.model.flows.record import Flow, FLOW_CONSTANTS, MAXWELL
 
@@ -47,13 +46,9 @@ class Creep:
         for name, least, most in (
                 ('ratio', 0.0, _STIFFEST), *((x.name, x.minimum, x.maximum) for x in constants)):
             for value in named[name]:
-                if not least <= value <= most:
-                    raise BadInputError(
-                        f'viscoelastic.{name} has {value:g}: expected {least:g} to {most:g}')
+                check_number(f'viscoelastic.{name}', value, least=least, most=most)
         for time in self.times:
-            if not 0.0 < time < math.inf:
-                raise BadInputError(
-                    f'viscoelastic.time has {time:g} s: expected finite numbers above 0')
+            check_number('viscoelastic.time', time, 's', above=0.0)
 
     @property
     def _named(self) -> dict[str, tuple[float, ...]]:
