@@ -20,7 +20,7 @@ from hmsa.cli.terminal import progress, under_way
 from hmsa.errors import BadInputError, check_number, HmsaError
 from hmsa.files import check_targets, write_text, yaml_text
 from hmsa.interfaces.quantities import quantity_of
-from hmsa_lab.cli.check_driver import settings_of
+from hmsa_lab.cli.check_driver import SETTINGS, settings_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -37,13 +37,11 @@ _NO_HYSTERESIS = 1e-4
 # Largest remaining drift of the stretch at the end of a level, as a fraction of the range.
 _SETTLED = 0.01
 
-_SET: Row = ('--set', 'KEY=VALUE', str, 'a setting of the hardware, as hardware.KEY of hmsa '
-             'driver; may be given several times', {'action': 'append', 'default': []})
 _LIMIT: Row = ('--limit', 'T', float, 'maximum flux density (default 0.01 T)', {'default': 0.01})
 _SOURCE: tuple[Row, ...] = (
     ('source', 'MODULE:NAME', str,
      'hardware as in the parameter hardware of hmsa driver, with a sensor', {'nargs': '?'}),
-    ('--simulate', 'calibrate a simulated bench with delays and noise'), _SET, _LIMIT)
+    ('--simulate', 'calibrate a simulated bench with delays and noise'), SETTINGS, _LIMIT)
 
 
 def add_parser(subparsers: Any) -> None:
@@ -56,7 +54,7 @@ def add_parser(subparsers: Any) -> None:
          'hardware as in the parameter hardware of hmsa driver, with an approximate coil '
          'constant; or readings with the columns current (A) and flux_density (T), in the '
          'order taken'),
-        _SET, _LIMIT,
+        SETTINGS, _LIMIT,
         ('--steps', 'N', int, 'levels on each quarter of the loop (default 5)', {'default': 5}),
         ('--settle', 'S', float, 'time at each level before it is read (default 1 s)',
          {'default': 1.0}),

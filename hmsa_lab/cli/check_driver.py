@@ -13,10 +13,15 @@ from pathlib import Path
 import sys
 from typing import Any
 
-from hmsa.cli.options import add_command, frequency, JSON, show
+from hmsa.cli.options import add_command, frequency, JSON, Row, show
 from hmsa.cli.terminal import progress
 from hmsa.errors import BadInputError
 from hmsa.files import check_targets, write_text
+
+#: Settings of a hardware class, read by `settings_of`.
+SETTINGS: Row = (
+    '--set', 'KEY=VALUE', str, 'a setting of the hardware, as hardware.KEY of hmsa driver; may be '
+    'given several times', {'action': 'append', 'default': []})
 
 
 def add_parser(subparsers: Any) -> None:
@@ -26,8 +31,7 @@ def add_parser(subparsers: Any) -> None:
         ('hardware', 'MODULE:NAME', str,
          'as in the parameter hardware of hmsa driver, such as serial_board'),
         ('--joint', 'NAME', str, 'name of the joint (default actuator)', {'default': 'actuator'}),
-        ('--set', 'KEY=VALUE', str, 'a setting of the class, as hardware.KEY of hmsa driver; may '
-         'be given several times', {'action': 'append', 'default': []}),
+        SETTINGS,
         ('--limit', 'T', float, 'maximum flux density (default 0.001 T)',
          {'default': 1e-3}),
         frequency('--rate', 'sample rate (default 200 Hz)', default=200.0),

@@ -19,6 +19,7 @@ from hmsa.cli.options import (
     add_command,
     argument,
     assume_example,
+    JSON,
     NAMESPACE,
     setpoint_of_joints,
     show,
@@ -64,7 +65,7 @@ def add_parser(subparsers: Any) -> None:
          'page to write, with the moves before and after; an existing file is replaced'),
         ('--folder', 'DIR', Path,
          'folder for the bags of the runs (default hmsa_tune/ plus date and time)'),
-        ('--json', 'print the result as JSON'),
+        JSON,
         NAMESPACE)
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import sys
 from typing import Any
 
-from hmsa.cli.options import add_command, show
+from hmsa.cli.options import add_command, JSON, show
 from hmsa.cli.terminal import progress
 from hmsa.ending import ENDING
 from hmsa.table import Column, Table
@@ -25,7 +25,7 @@ def add_parser(subparsers: Any) -> None:
     add_command(
         subparsers, __name__, __doc__,
         ('--out', 'DIR', Path, 'output folder (default hmsa_demo/ plus date and time)'),
-        ('--json', 'print the result as JSON'))
+        JSON)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -16,7 +16,15 @@ from pathlib import Path
 import sys
 from typing import Any, TYPE_CHECKING
 
-from hmsa.cli.options import add_command, assume_example, JOINTS, NAMESPACE, SEQUENCE, sequence_of
+from hmsa.cli.options import (
+    add_command,
+    assume_example,
+    JOINTS,
+    JSON,
+    NAMESPACE,
+    SEQUENCE,
+    sequence_of,
+)
 from hmsa.cli.terminal import progress, show_notes, with_notes
 from hmsa.ending import ENDING
 from hmsa.errors import BadInputError, check_number
@@ -57,7 +65,7 @@ def add_parser(subparsers: Any) -> None:
          {'default': 1}),
         ('--report', 'also write report.html'),
         ('--out', 'DIR', Path, 'folder for the output (default hmsa_run/ plus date and time)'),
-        ('--json', 'print the result as JSON'),
+        JSON,
         NAMESPACE,
         JOINTS)
 
