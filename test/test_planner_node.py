@@ -17,7 +17,6 @@ from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
-from hmsa.errors import HmsaError
 from hmsa.identification.files import errors_from
 from hmsa.interfaces import topics
 from hmsa.model.parameters import paper_actuator
@@ -192,19 +191,6 @@ def test_sequence_comes_out_as_the_command_stream_of_the_core_plan(bench):
         any(x.magnetic_field_covariance) for x in planner.commands)
 
 
-def test_each_command_is_sent_once_its_stamp_is_no_more_than_lead_time_ahead(bench):
-    planner = bench()
-    planner.request(*SEQUENCE)
-    sent = []
-    while planner.now < END:
-        known = len(planner.commands)
-        planner.at(planner.now + 4 * MS)
-        sent += [(planner.now, from_command(x)[0]) for x in planner.commands[known:]]
-    assert len(sent) == 5
-    for now, stamp in sent:
-        assert now <= stamp <= now + LEAD
-
-
 def test_lead_time_of_the_parameter_is_kept(bench):
     planner = bench('-p', 'lead_time:=0.2')
     planner.core.set_options(replace(planner.core.options, lead_time=200 * MS))
@@ -268,14 +254,6 @@ def test_future_stamp_keeps_the_running_plan_until_then(bench):
     planner.check()
     # Two levels of the first setpoint, one that is cut off, two of the new one, two of the check.
     assert len(planner.commands) >= 6
-
-
-def test_past_stamp_with_an_end_ahead_joins_in_the_middle(bench):
-    planner = bench()
-    planner.request(*SEQUENCE, stamp=START - MS)
-    assert [x.stretch for x in planner.core.plan.segments] == [1.2, 1.4]
-    planner.run(END)
-    planner.check()
 
 
 def test_velocities_are_followed_in_mode_path_which_can_be_set_while_it_runs(bench):
@@ -354,16 +332,6 @@ def test_setpoint_is_reached_as_soon_as_possible_and_held(bench):
     status = planner.verdict('unobserved', state='at_rest', stretch='1.25')
     assert 'predicted, not measured' in status.message
     planner.setpoint(0.9)
-    planner.check()
-
-
-def test_setpoint_sent_again_and_again_changes_nothing(bench):
-    planner = bench()
-    planner.setpoint(1.25)
-    for now in range(START + 100 * MS, START + 300 * MS, 100 * MS):
-        planner.at(now)
-        planner.setpoint(1.25, 'unchanged')
-    assert len(planner.plans) == 1
     planner.check()
 
 
@@ -500,21 +468,6 @@ def test_bad_setpoints_are_refused_with_a_reason_and_the_running_plan_goes_on(be
         status = planner.verdict(code, plan=1)
         assert status.level == ERROR
         assert fragment in status.message
-    planner.check()
-
-
-def test_plan_that_cannot_be_computed_is_a_refusal_too(bench, monkeypatch):
-    def fails(*_: Any) -> None:
-        raise HmsaError('the integration ran out of steps')
-
-    planner = bench()
-    planner.request(*SEQUENCE)
-    with monkeypatch.context() as patch:
-        patch.setattr(Planner, 'draft_setpoint', fails)
-        planner.setpoints.publish(Float64(data=1.2))
-        status = planner.verdict('not_converged', plan=1)
-    assert (status.level, status.message) == (ERROR, 'the integration ran out of steps')
-    planner.run(END)
     planner.check()
 
 
