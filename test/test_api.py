@@ -743,7 +743,7 @@ def test_a_law_is_chosen_by_option(files, capsys):
     (['plan', '1.1:10', '--law', 'yeoh'], 'as in --law yeoh:c10=VALUE'),
     (['plan', '1.1:10', '--law', 'gent', '--params-file', 'actuator.yaml'], 'both --params-file'),
     (['plan', '1.1:10', '--amplifier'], 'expected --params-file with it'),
-    (['plan', '1.1:1', '--inductance', '-5mH'], 'expected more than 0 H'),
+    (['plan', '1.1:1', '--inductance', '-5mH'], 'is -0.005 H: expected a finite'),
     (['init', '--beam', '--law', 'yeoh:c10=1kPa', '--yes', '--out', 'b.yaml'], 'with --beam'),
     (['init', '--law', 'yeoh:c10=1kPa', '--j-lim', '5', '--yes', '--out', 'b.yaml'], 'constants'),
     (['wave', 'tringle', '--frequency', '5', '--amplitude', '0.05'],

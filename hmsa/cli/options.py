@@ -82,9 +82,9 @@ def of_unit(option: str, unit: str, text: str) -> Row:
     def read(words: str) -> float:
         from hmsa.interfaces.quantities import quantity_of
 
-        value = quantity_of(words, unit, option.removeprefix('--').replace('-', ' '))
-        if not value > 0.0:
-            raise BadInputError(f'{value:g} {unit}: expected more than 0 {unit}')
+        name = option.removeprefix('--').replace('-', ' ')
+        value = quantity_of(words, unit, name)
+        check_number(name, value, unit, above=0.0)
         return value
 
     return option, 'X', argument(read), f'{text} [{unit}]'
