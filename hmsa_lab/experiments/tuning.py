@@ -71,8 +71,8 @@ class Expected:
 
 
 def compare_shapers(
-        actuator: Actuator, setpoints: Sequence[tuple[float, float]], known: Known, *,
-        seed: int = 0) -> list[Expected]:
+        actuator: Actuator, setpoints: Sequence[tuple[float, float]],
+        known: Known) -> list[Expected]:
     """
     Return the expected residual vibration and move time of each of `CANDIDATES`.
 
@@ -84,8 +84,6 @@ def compare_shapers(
         Stretches and durations in s.
     known : Known
         Values and covariance; other parameters count as exact.
-    seed : int
-        Seed of the drawn parameters.
 
     Returns
     -------
@@ -94,7 +92,7 @@ def compare_shapers(
 
     """
     places = [i for i, x in enumerate(known.names) if x in ACTUATOR_FIELDS and known.values]
-    drawn = np.random.default_rng(seed).multivariate_normal(
+    drawn = np.random.default_rng(0).multivariate_normal(
         np.zeros(len(places)), known.covariance[np.ix_(places, places)], _DRAWS)
     truths = [
         actuator.scaled(**{
