@@ -32,6 +32,7 @@ from hmsa.interfaces.actuator import planned_from
 from hmsa.interfaces.topics import PLANNER
 from hmsa.model.equations import natural_frequency
 from hmsa.model.parameters import ActuatorParameters, paper_actuator
+from hmsa.model.sensor import Sample
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Options, Planner
 from hmsa.planning.timeline import PlannedSegment
@@ -224,10 +225,10 @@ class Driver:
         self.changes_seen += [x[1:] for x in found]
         return found
 
-    def samples(self) -> Sequence[tuple[int, Any, Any, Any]]:
+    def samples(self) -> Sequence[Sample]:
         """Return the measured samples."""
-        found = [(x.time, x.stretch, x.rate, x.flux_density) for x in self.device.samples()]
-        self.samples_seen += [(x[0], float(x[1][0])) for x in found]
+        found = self.device.samples()
+        self.samples_seen += [(x.time, float(x.stretch[0])) for x in found]
         return found
 
 

@@ -11,6 +11,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from hmsa.identification.known import Known
+from hmsa.model.sensor import Sample
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Options as PlannerOptions
 from hmsa.planning.planner import Planner
@@ -78,7 +79,7 @@ class Bench:
         while self.next_sample <= time:
             shown = self.block.at(self.next_sample) + 1e-3 + (
                 self._noise * self._random.standard_normal())
-            self._waiting.append((self.next_sample, *(np.array([x]) for x in (
+            self._waiting.append(Sample(self.next_sample, *(np.array([x]) for x in (
                 shown, math.nan, math.nan))))
             self.next_sample += MS
         late = len([x for x in self._waiting if x[0] <= time - 2 * MS])
