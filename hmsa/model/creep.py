@@ -4,8 +4,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from hmsa.errors import BadInputError, check_choice, check_number
-from hmsa.model.flows import FLOWS
-from hmsa.model.flows.record import Flow, FLOW_CONSTANTS, MAXWELL
+from hmsa.model.flows import Flow, FLOW_CONSTANTS, FLOWS, MAXWELL
 
 #: Maximum number of branches.
 MOST = 3

@@ -19,7 +19,7 @@ from hmsa.model.actuators import Actuators, RTOL, Setup
 from hmsa.model.creep import Creep
 from hmsa.model.delivery import Delivery, IDEAL, Piece, ramps
 from hmsa.model.equations import Array
-from hmsa.model.flows.record import MAXWELL
+from hmsa.model.flows import MAXWELL
 from hmsa.model.moves import Level, State
 from hmsa.model.parameters import ActuatorParameters, NondimensionalParameters
 from hmsa.model.schedule import CommandSchedule
