@@ -11,7 +11,7 @@ from scipy.constants import mu_0
 from scipy.integrate import solve_ivp
 
 from hmsa.model.parameters import ActuatorParameters, paper_actuator
-from hmsa_ros.runtime.records import EstimateChanged, Settings, StretchRequest
+from hmsa_ros.runtime.records import EstimateChanged, ObservedSample, Settings, StretchRequest
 
 # Integration ahead of the present time, in ns.
 _AHEAD = 200 * MS
@@ -88,7 +88,8 @@ class Bench(AtWork):
 
     def __init__(
             self, plant: Plant, nominal: ActuatorParameters, noise: float, *, lead: int = 2 * MS,
-            delay: int = 2 * MS, seed: int = 0, limit: float = 0.5, report=True, **settings):
+            delay: int = 2 * MS, seed: int = 0, limit: float = 0.5, report=True, glances=False,
+            **settings):
         self.plant, self.noise, self.delay = plant, noise, delay
         self.random = np.random.default_rng(seed)
         self.sense: Callable = lambda time, stretch: [(time, stretch)]
@@ -96,11 +97,15 @@ class Bench(AtWork):
         self.effort: Callable = lambda: math.nan  # field in T reported by the device
         self.wire = []
         self.sent = []
+        self.glances, self.newest = glances, None  # whether requests see the newest sample
         super().__init__(
             {'a': planner(
                 nominal, flux_density_min=-limit, flux_density_max=limit, lead_time=lead)},
             Settings(**{'takeover_timeout': 0, 'heartbeat_period': 0, 'feedback': 'adapt',
-                        **settings}), START)
+                        **settings}), START, one_clock=lambda: True, glance=self.glance)
+
+    def glance(self):
+        return [('a', self.newest)] if self.glances and self.newest else []
 
     @property
     def estimates(self):
@@ -132,6 +137,7 @@ class Bench(AtWork):
             self.wire += [(self.now + self.delay, *x) for x in self.sense(self.now, noisy)]
             while self.wire and self.wire[0][0] <= self.now:
                 _, stamp, value = self.wire.pop(0)
+                self.newest = ObservedSample(stamp, value, math.nan, self.effort(), came=self.now)
                 self.show(stamp, value, flux_density=self.effort())
         return np.array(seen)
 

@@ -10,7 +10,7 @@ import pytest
 
 from hmsa_lab.adapt import adaptive_joint, corrections, estimator, window
 from hmsa_lab.adapt.motion import follow
-from hmsa_ros.runtime.records import Severity, Trajectory
+from hmsa_ros.runtime.records import Severity, StretchRequest, Trajectory
 
 MOVES = (1.4, 1.1, 1.4, 1.1, 1.4)
 
@@ -69,6 +69,20 @@ def test_what_a_faulty_sensor_taught_is_forgotten_with_a_healthy_one(fault):
 @pytest.mark.parametrize('fault', FAULTS)
 def test_all_faults_of_a_sensor_are_forgotten_by_all_actuators(fault, slow, noise):
     check_unlearnt(fault, slow, noise)
+
+
+def test_a_move_does_not_begin_where_a_sensor_in_doubt_shows_the_actuator():
+    it = bench(False, 1e-3, factors={'shear_modulus': 1.1}, glances=True,
+               takeover_timeout=500 * MS)
+    it.effort = lambda: [level for stamp, level in it.plant.levels if stamp <= it.now][-1]
+    it.runtime.request(StretchRequest('a', 1.2))
+    it.pass_time(300 * MS)
+    moves(it, MOVES[:2])
+    it.sense = FAULTS['scaled']()
+    moves(it, MOVES[:1])
+    # It would wait for a sample with a rate, and begin at twice the strain.
+    assert it.runtime.request(StretchRequest('a', 1.1)).code == 'accepted'
+    assert it.planner.plan.levels[0].stretch == pytest.approx(1.4, abs=2e-3)
 
 
 # What is wrong of the plant, of the block, by how many ms timestamps are late, and what is said:

@@ -178,6 +178,11 @@ class AdaptiveJoint:
         """The fitting estimate if it is to be used: not that of a sensor that has changed."""
         return None if self.sensor_changed else self.fitting
 
+    @property
+    def doubted(self) -> bool:
+        """Whether samples may be wrong, so that plans begin from the prediction."""
+        return self.adapts and not self.lost and bool(self.trust.why or self.sensor_changed)
+
     # -- samples -------------------------------------------------------------------------------
 
     @property

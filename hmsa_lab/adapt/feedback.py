@@ -150,9 +150,10 @@ class Feedback(Follower):
         return self._corrections.take(work, drafts, now)
 
     def follows(self, name: str) -> bool:
-        """Return whether plans for a joint begin from its estimate."""
+        """Return whether plans for a joint do not begin from its newest sample."""
         joint = self.joints.get(name)
-        return joint is not None and joint.adapted() and joint.state(self._clock()) is not None
+        return joint is not None and (
+            joint.doubted or joint.adapted() and joint.state(self._clock()) is not None)
 
     def sensor(self, name: str) -> SensorModel:
         """Return the sensor of a joint as estimated; as given where there is no estimate."""

@@ -75,7 +75,7 @@ class Follower:
         return None
 
     def follows(self, joint: str) -> bool:
-        """Return whether plans for a joint begin from its estimate."""
+        """Return whether plans for a joint do not begin from its newest sample."""
         return False
 
     def sensor(self, joint: str) -> SensorModel:
