@@ -85,8 +85,8 @@ class Trust:
 
     @property
     def failed(self) -> bool:
-        """Whether an estimate in use has failed to fit later samples."""
-        return self._failures > 0
+        """Whether an estimate in use has failed to fit later samples, after one was confirmed."""
+        return self._failures > 0 and self.confirmed is not None
 
     def restarted(self, rejected: int, begin: int) -> None:
         """
