@@ -1,7 +1,8 @@
 """
 Words that readers search for and the page that answers each, entered into its index.
 
-Sphinx's search lists a page whose index entry is searched for before those that contain the words.
+Sphinx's search lists a page whose main index entry is searched for before those that contain the
+words, and pages with other entries after all of them.
 """
 
 from typing import Any
@@ -16,23 +17,25 @@ WORDS = {
     'explanation/creep': ('viscoelastic', 'relaxation'),
     'explanation/faults': ('emergency stop', 'interlock', 'watchdog'),
     'explanation/modes': ('mode shapes',),
+    'explanation/robustness': ('compare shapers', 'robustness'),
     'explanation/temperature': ('temperature', 'warming'),
     'explanation/which-shaper': ('choose a shaper', 'input shaping', 'ZV'),
     'guides/calibration': ('field to current', 'current', 'ampere', 'coil constant'),
-    'guides/hyperelastic-models': ('Gent', 'Ogden', 'Yeoh', 'stress-strain curve'),
+    'guides/hyperelastic-models': ('Gent', 'Ogden', 'Yeoh', 'own material', 'stress-strain curve'),
     'guides/recording': ('Matlab', 'CSV', 'rosbag', 'export', 'replay'),
-    'guides/report': ('figure', 'plot', 'paper figure'),
+    'guides/report': ('report', 'figure', 'plot', 'paper figure'),
     'guides/sensors': ('camera', 'laser', 'millimetres', 'motion capture'),
     'guides/serial-board': ('Arduino', 'microcontroller'),
     'guides/several-actuators': ('several actuators', 'two actuators', 'joints'),
-    'guides/setpoints': ('stop', 'joystick', 'MoveIt', 'trajectory', 'publish a sequence'),
+    'guides/setpoints': ('send', 'stop', 'joystick', 'MoveIt', 'trajectory', 'publish a sequence'),
     'guides/sweeps': ('sweep', 'parameter study'),
     'guides/viewers': ('RViz', 'Foxglove', 'PlotJuggler'),
-    'guides/without-ros': ('gait', 'sine wave', 'periodic motion'),
+    'guides/without-ros': ('plan', 'simulate', 'gait', 'sine wave', 'periodic motion'),
     'reference/driver': ('bench supply',),
     'tutorials/first-run': ('demo', 'install'),
-    'tutorials/identify': ('system identification', 'fit parameters'),
+    'tutorials/identify': ('identify', 'system identification', 'fit parameters'),
     'tutorials/notebook': ('Python', 'notebook', 'pandas', 'xarray', 'pint'),
+    'tutorials/your-own-actuator': ('limits of the coil', 'parameter file'),
     'tutorials/your-own-driver': ('own driver', 'amplifier'),
 }
 
@@ -41,7 +44,7 @@ def enter(app: Sphinx, document: nodes.document) -> None:
     """Enter the words of a page, with its beginning as their target."""
     words = WORDS.get(app.env.docname, ())
     if words:
-        entry = addnodes.index(entries=[('single', x, 'searched', '', None) for x in words])
+        entry = addnodes.index(entries=[('single', x, 'searched', 'main', None) for x in words])
         document.insert(0, [entry, nodes.target(ids=['searched'])])
 
 

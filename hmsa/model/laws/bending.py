@@ -143,6 +143,11 @@ def tabulated(
         Returns the energies at the starts of the pieces, (p,), of these, their widths, and the
         coefficients of the force, (p, n).
 
+    Returns
+    -------
+    tuple of float
+        The constants, in this order.
+
     """
     share = (1.0 - np.sqrt(1.0 - end / fold)) / count
     breaks = fold * (1.0 - (1.0 - share * np.arange(count + 1)) ** 2)
