@@ -247,6 +247,30 @@ def test_third_order_of_modal_leaves_less_where_frequencies_are_wrong(target, fa
     assert left[3] < 0.75 * left[2]
 
 
+@pytest.mark.parametrize('shape', [0.1, 0.5, 1.0, 4.0])
+def test_modal_takes_2_3_and_3_5_times_as_long_as_the_two_step_command_of_the_paper(shape):
+    with unquestioned():
+        paper = Actuator(half_thickness=0.01 * shape, damping_ratio=0.05, chain_limit=5.0)
+        block = paper.replace(mount='free')
+    unit = block.block.time_unit / paper.block.time_unit
+    for target in (0.9, 1.1, 1.2):
+        whole = get_shaper('two_step')(
+            MoveRequest(State(1.0), target, paper.model.material)).duration
+        for order, most in ((2, 2.3), (3, 3.5)):
+            move = get_shaper('modal')(
+                MoveRequest(State(1.0), target, block.model.material, order=order))
+            assert 0.95 * most < unit * move.duration / whole <= most
+
+
+def test_vibration_that_modal_is_said_to_leave_is_that_of_the_motion():
+    material = Actuator(mount='free').model.material
+    request = MoveRequest(State(1.0), 1.2, material)
+    move = get_shaper('modal')(request)
+    times = move.duration + np.linspace(0.0, 2.0 * math.pi / request.frequency, 400)
+    seen, _ = observed(sampled(move.levels, request.start, times, material), material)
+    assert remaining(request, move).vibration == pytest.approx(np.ptp(seen) / 0.2, rel=1e-2)
+
+
 def test_modal_without_modes_is_the_two_step_command():
     request = MoveRequest(State(1.0), 1.2, paper_actuator().nondimensional)
     assert get_shaper('modal')(request) == get_shaper('two_step')(request)

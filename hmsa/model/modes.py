@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 import math
 from typing import Any
 
@@ -115,15 +116,19 @@ class Modes:
         """Return the shares of all modes in small motion about a stretch, from the first on."""
         if not any(self.share_exponents):
             return (self.first, *self.shares)
-        grown, total, _ = self._graded(stretch)
+        grown, total = self._grown(stretch)
         shares = tuple(float(x / total) for x in grown)
         return (1.0 - sum(shares), *shares)
 
-    def _graded(self, stretch: Any) -> tuple[list[Any], Any, Any]:
-        """Return shares relative to a sum at a stretch, this sum, and its relative slope."""
+    def _grown(self, stretch: Any) -> tuple[list[Any], Any]:
+        """Return shares relative to a sum at a stretch, and this sum."""
         grown = [x * stretch ** y for x, y in zip(
             self.shares, self.share_exponents, strict=True)]
-        total = 1.0 + sum(abs(x) - abs(y) for x, y in zip(grown, self.shares, strict=True))
+        return grown, 1.0 + sum(map(abs, grown)) - sum(map(abs, self.shares))
+
+    def _graded(self, stretch: Any) -> tuple[list[Any], Any, Any]:
+        """Return shares relative to a sum at a stretch, this sum, and its relative slope."""
+        grown, total = self._grown(stretch)
         return grown, total, sum(abs(x) * y for x, y in zip(
             grown, self.share_exponents, strict=True)) / (stretch * total)
 
@@ -159,7 +164,7 @@ class Modes:
         """Return whether there are secondary modes."""
         return bool(self.ratios)
 
-    @property
+    @cached_property
     def ringing(self) -> tuple[int, ...]:
         """Indices of the modes that ring, with a damping ratio below `BROAD`."""
         return tuple(i for i, x in enumerate(self.dampings) if x < BROAD)

@@ -21,6 +21,7 @@ from hmsa.motion._motion import (
     respond,
     rest,
     sample,
+    smooth,
     solve,
     staircase,
     subsets,
@@ -34,7 +35,7 @@ from hmsa.motion._motion import (
 __all__ = [
     'accelerations', 'critical_zeta', 'damping', 'elastic_energy', 'elastic_force',
     'elastic_stiffness', 'equilibrium_stretch', 'evaluate', 'flow_rates', 'follow',
-    'mass', 'natural_frequency', 'respond', 'rest', 'sample', 'solve', 'staircase',
+    'mass', 'natural_frequency', 'respond', 'rest', 'sample', 'smooth', 'solve', 'staircase',
     'subsets', 'trail', 'turning_point', 'two_step', 'two_step_batch', 'two_step_late']
 
 #: Statuses of a turning point: found; approach to an equilibrium instead; out of steps; too close

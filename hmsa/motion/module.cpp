@@ -9,6 +9,7 @@
 #include "hmsa/batch.hpp"
 #include "hmsa/late.hpp"
 #include "hmsa/response.hpp"
+#include "hmsa/smooth.hpp"
 #include "hmsa/subsets.hpp"
 #include "hmsa/tail.hpp"
 
@@ -379,6 +380,14 @@ std::tuple<bool, double, int> solve(Results times, Results loads, Numbers d_time
     });
     return {solved, lasts, work};
 }
+// Returns whether there are levels, and writes them and their changes by unit conditions.
+bool smooth(double phase, int rings, Numbers modes, double bent, Results out)
+{
+    const int rows = 1 + 2 * rings, levels = out.count / rows;
+    return fit(0 < rings && rings <= most_rings && modes.count % 3 == 0 && modes.count >= 3 * rings
+            && out.count == rows * levels && 0 < levels && levels <= most_equal)
+        && Smooth{levels, rings, modes.count / 3 - rings, phase, modes.data, bent, out.data}();
+}
 // Returns the number of levels and an upper bound of their vibration.
 std::tuple<int, double> staircase(Numbers behind, Numbers branches, double stretch, Numbers material,
     double lag, double period, double end, double ripple, Results out)
@@ -516,7 +525,7 @@ PyMethodDef methods[] = {
     method<two_step_of>("two_step"), method<two_step_late>("two_step_late"),
     method<two_step_batch>("two_step_batch"), method<follow>("follow"),
     method<sample_of>("sample"), method<flow_rates>("flow_rates"), method<trail_of>("trail"),
-    method<solve>("solve"), method<staircase>("staircase"),
+    method<solve>("solve"), method<smooth>("smooth"), method<staircase>("staircase"),
     method<respond>("respond"), method<rest>("rest"),
     method<subsets>("subsets"), {nullptr, nullptr, 0, nullptr}};
 PyModuleDef module = {PyModuleDef_HEAD_INIT, "_motion", nullptr, 0, methods, nullptr, nullptr, nullptr, nullptr};

@@ -29,6 +29,7 @@ from hmsa.planning.shapers.request import MoveRequest, Shaper, StepBudget
 
 # Samples of the first period after a move, and their tolerance.
 _SAMPLED, _RTOL = 100, 1e-7
+_TIMES: Array = np.linspace(0.0, 1.0, _SAMPLED, dtype=np.float64)
 # Vibration in fractions of the move below which nothing is told, and from which another shaper is
 # advised; and that which an unshaped step leaves at least, so that only then it is computed.
 _TOLD, _MUCH, _LIKE_A_STEP = 5e-4, 1e-2, 0.4
@@ -89,7 +90,8 @@ def remaining(request: MoveRequest, move: Move) -> Remaining | None:
         return None
     half = math.pi / request.frequency
     start = move.duration if move.duration < math.inf else move.levels[-1].time + half
-    seen = _after(request, move.levels, start, 2.0 * half)
+    after = _fading if move.code is Code.MODAL else _after
+    seen = after(request, move.levels, start, 2.0 * half)
     if seen is None:
         return None
     rows, whole = seen
@@ -104,6 +106,32 @@ def remaining(request: MoveRequest, move: Move) -> Remaining | None:
         step = left if left < vibration else math.nan
     broad = most > 0 and most - 1 not in modes.ringing
     return Remaining(vibration, most + 1, (1.0, *modes.ratios)[most], broad, step)
+
+
+def _fading(
+        request: MoveRequest, levels: Sequence[Level], start: float,
+        duration: float) -> tuple[list[Array], Array] | None:
+    """Return the result of `_after` where only modes that do not ring move, about the target."""
+    material, target = request.material, request.target
+    try:
+        found = sampled(
+            levels, request.start, np.array([start]), material, request.delivery, _RTOL)[:, 0]
+    except HmsaError:
+        return None
+    state = found[motion.FOLLOWED + len(material.branches):]
+    modes, times = material.modes, duration * _TIMES
+    whole, rows = np.full(_SAMPLED, target), [np.full(_SAMPLED, target)] * (1 + len(modes.ratios))
+    for i, ((ratio, _, damping, exponent, _), share) in enumerate(zip(
+            modes.numbers, modes.at(target)[1:], strict=True)):
+        if i in modes.ringing:
+            continue
+        frequency = request.frequency * ratio * target ** exponent
+        rate = complex(-damping, math.sqrt(1.0 - damping ** 2)) * frequency
+        position, speed = state[2 * i] - target, state[2 * i + 1]
+        size = complex(position, (rate.real * position - speed) / rate.imag)
+        rows[i + 1] = target + (size * np.exp(rate * times)).real
+        whole = whole + share * (rows[i + 1] - target)
+    return rows, whole
 
 
 def _after(

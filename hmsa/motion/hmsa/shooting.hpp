@@ -27,6 +27,8 @@ template <class System, int P> struct Shooting {
     // relative to the move; and the relative distance from rest below which the final one applies.
     static constexpr double first = 1e-6, rough = 1e-8, rough_share = 1e-7, fine_most = 1e-12,
         fine_share = 1e-11, fine_least = 1e-13, near = 2e-4;
+    // With secondary modes, whose guesses are near.
+    static constexpr double modal_rough = 1e-5, modal_share = 1e-5, modal_last = 1e-11;
     // A ramp that misses the next level by less counts as reaching it.
     static constexpr double reached = 1e-12;
     static constexpr int most = 25;
@@ -55,6 +57,7 @@ template <class System, int P> struct Shooting {
     int conditions;
     int work = 0;  // steps, times the number of values and derivatives
 
+    bool modal() const { return branches.modes.count > 0; }
     // Computes the pieces of the load and their derivatives; false if a ramp does not fit.
     bool cut()
     {
@@ -131,9 +134,10 @@ template <class System, int P> struct Shooting {
         for (int b = 0; b < branches.rows(); b++)
             motion.y[2 + b] = motion.y[2 + b] + shot.followed[b];
         S field = 0.0 * motion.y[0] + shot.field;
+        double h = 0;
         for (int m = 0; m < count; m++) {
             auto drive = following(with<S>(begin[m], d_begin[m]), slope[m], shot.lag, field);
-            double h = 0;
+            h = modal() ? h : 0;  // many pieces, which change little
             constexpr int each = 2 + count_of<S>;
             motion.room = min(most_attempts, (shot.most_work - work) / each);
             const int before = motion.made;
@@ -303,8 +307,8 @@ template <class System, int P> struct Shooting {
         double x[P] = {}, step[P] = {}, jacobian[most_unknowns][P] = {};
         double share = 1, size = infinity(), before = infinity();
         const double fine = max(fine_least, min(fine_most, fine_share * move));
-        double rtol = max(fine, min(rough, rough_share * move));
-        double tolerance = max(rtol, min(first, rough_share * move));
+        double rtol = max(fine, modal() ? min(modal_rough, modal_share * move) : min(rough, rough_share * move));
+        double tolerance = modal() ? rtol : max(rtol, min(first, rough_share * move));
         bool measuring = false;
         for (int pass = 0; pass < most && work < shot.most_work;) {
             place(x, share, step);
@@ -335,7 +339,7 @@ template <class System, int P> struct Shooting {
                     x[c] += step[c];
                 before = now, share = 0;
                 // With derivatives from this distance, about that fraction remains.
-                if (now * size <= last * move * move) {
+                if (now * size <= (modal() ? modal_last : last) * move * move) {
                     place(x, share, step);
                     const bool still = cut();
                     lasts = whole();

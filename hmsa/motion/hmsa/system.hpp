@@ -318,6 +318,7 @@ enum Column { ratio_at, speed_at, flow_at, follower_at = flow_at + 1 + flow_cons
 // of this. The first of them is the second mode of the elastica, if the actuator is one.
 struct Modes {
     int count = 0;
+    bool grows = false;  // whether a frequency ratio does
     double share[most_modes] = {}, ratio[most_modes] = {}, damping[most_modes] = {},
         exponent[most_modes] = {};
 
@@ -327,7 +328,8 @@ struct Modes {
             share[count] = rows[ratio_at];
             ratio[count] = rows[speed_at];
             damping[count] = rows[flow_at + 1];
-            exponent[count++] = rows[flow_at + 2];
+            exponent[count] = rows[flow_at + 2];
+            grows |= exponent[count++] != 0;
         }
     }
     // Changes of positions and rates, in turns, under the load beyond the elastic force. The first
@@ -347,24 +349,31 @@ struct Modes {
                     return;
                 at += 2, by += 2;
             }
+        // z'' = g^2 (f/m + w^2 (l - z)) - 2 d w g z', with the ratio g of the frequency to w.
         constexpr double aside = 1e-5;  // of a central difference
-        const S &l = state[0];
-        const double x = value(l);
+        const double l = value(state[0]), pull = value(net);
         const auto squared = [&](double y) { return abs(system.elastic(y).d[0] / system.mass(y)); };
-        const auto slope = [&](double before, double after) { return (after - before) / (2 * aside); };
-        const double here = squared(x), mass = system.mass(x), root = sqrt(here);
-        const S square = through(l, here, slope(squared(x - aside), squared(x + aside)));
-        const S light = through(
-            l, 1 / mass, slope(1 / system.mass(x - aside), 1 / system.mass(x + aside)));
-        const S frequency = square * (0.5 / root) + 0.5 * root;
-        const S pull = net * light;
+        const double square = squared(l), light = 1 / system.mass(l), root = sqrt(square);
+        double square_slope = 0, light_slope = 0;
+        if constexpr (count_of<S> > 0) {
+            square_slope = (squared(l + aside) - squared(l - aside)) / (2 * aside);
+            light_slope = (1 / system.mass(l + aside) - 1 / system.mass(l - aside)) / (2 * aside);
+        }
+        const double logarithm = grows ? log(l) : 0;
         for (; k < count; k++, at += 2, by += 2) {
-            S grown = 0.0 * l + ratio[k];
-            if (exponent[k] != 0)
-                grown = grown * power(l, exponent[k]);
+            const double g = exponent[k] != 0 ? ratio[k] * exp(exponent[k] * logarithm) : ratio[k];
+            const double beside = l - value(at[0]), rate = value(at[1]);
+            const double drag = 2 * damping[k] * root * g, drive = pull * light + square * beside;
             by[0] = at[1];
-            by[1] = grown * grown * (pull + square * (l - at[0]))
-                - frequency * grown * (2 * damping[k]) * at[1];
+            by[1] = S{} + (g * g * drive - drag * rate);
+            if constexpr (count_of<S> > 0) {
+                const double grown = exponent[k] != 0 ? exponent[k] / l : 0;  // of ln g
+                const double by_l = g * g * (2 * grown * drive + pull * light_slope + square_slope * beside + square)
+                    - drag * rate * (0.5 * square_slope / square + grown);
+                for (int c = 0; c < count_of<S>; c++)
+                    by[1].d[c] = by_l * state[0].d[c] + g * g * (light * net.d[c] - square * at[0].d[c])
+                        - drag * at[1].d[c];
+            }
         }
     }
 };

@@ -5,65 +5,70 @@ A move has more free levels than rest has conditions: two for each mode, and fur
 hardware as in `free`.
 
 Those of a block have equal durations. A command that is as short as possible would excite the
-modes that no model contains: by default it takes two half periods of the first mode. Of all levels
-that bring the modes to rest, it has those that are expected to leave least in weak modes. The
-secondary modes of a beam are fast and weak: its command is the two-step command, convolved with an
-input shaper of zero vibration (N. C. Singer, W. P. Seering, J. Dyn. Syst. Meas. Control 112, 76,
-1990) for each of them, and changed as little as rest demands.
+modes that no model contains: by default it takes 2.3 times as long as the two-step command of the
+paper. Of all levels that bring the modes to rest in linear motion, it has those that are expected
+to leave least in weak modes, changed as little as rest demands. The secondary modes of a beam are
+fast and weak: its command is the two-step command, convolved with an input shaper of zero
+vibration (N. C. Singer, W. P. Seering, J. Dyn. Syst. Meas. Control 112, 76, 1990) for each of
+them, and changed as little as rest demands.
 """
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import partial
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hmsa import motion
 from hmsa.model import law
 from hmsa.model.equations import Array
 from hmsa.model.moves import Level, Move, State
+from hmsa.model.parameters import NondimensionalParameters
 from hmsa.model.simulation import followed_by
 from hmsa.model.status import Code, RefusedError
 from hmsa.planning.shapers.free import at_rest
 from hmsa.planning.shapers.request import AT_REST, MoveRequest
 from hmsa.planning.shapers.two_step import two_step
-from hmsa.planning.shooting import Attempt, heights, solve, within_limits
+from hmsa.planning.shooting import Attempt, heights, solve, Template, within_limits
 
 # Durations to try, in units of the wanted one: near solutions that swing back and forth there are
 # others without (benchmarks continuum).
 _LENGTHS = (1.0, 1.06, 0.94, 1.14, 1.25, 1.4, 1.6, 2.0)
-# Levels of a block in each half period, and fractions of those that it takes: the second if weak
-# modes have this mean frequency ratio or more (benchmarks continuum).
-_LEVELS, _SHORTER, _BRISK, _FAR = 4, 0.97, 0.955, 4.0
+# Duration of each order in half periods of a block that deforms uniformly, and of all less; levels
+# at least, and at least for each order (benchmarks continuum).
+_SPAN, _LESS, _LEVELS, _MORE_LEVELS = 1.195, 0.1, 12, 4
 # For the expected vibration: relative error of all frequencies, weight of the bends, multiples of
-# the fastest ringing mode and of the mean of the weak ones between which these are, and how many;
+# the fastest ringing mode and of the mean of the weak ones between which these are, and where;
 # mean in units of the fastest and share of those that nobody gave.
-_ERROR, _BENT, _ABOVE, _WIDE, _BAND, _UNKNOWN = 0.03, 0.01, 1.1, 1.5, 24, (1.4, 0.05)
+_ERROR, _BENT, _ABOVE, _BELOW, _WIDE = 0.03, 0.012, 1.1, 0.5, 1.5
+_BAND, _UNKNOWN = 24, (1.4, 0.05)
+_PLACES: Array = np.linspace(0.0, 1.0, _BAND, dtype=np.float64)
 # Largest load beyond those of start and end, in units of the largest change that the motion needs.
 _BEYOND = 0.3
 # Durations of levels in units of those of their ramps, at least.
 _MORE = 1.25
 # Motion below this fraction of the move is none for the guess.
 _STILL = 1e-3
-# Durations and loads of the free levels.
-_Guess = tuple[list[float], list[float]]
+# Mean frequency ratio and share of the weak modes, if there are any.
+_Weak = tuple[float, float] | None
 
 
 def modal(request: MoveRequest) -> Move:
     """
     Come to rest with all modes that ring.
 
-    A block takes ``request.order`` half periods of the first mode, or up to 5 % less; a beam as
-    long as the two-step command, half a period of each secondary mode, and half periods of the
-    first beyond order 2.
+    A block takes 2.3 times as long as the two-step command of a block of uniform deformation, and
+    1.2 times longer for each order beyond 2. A beam takes as long as the two-step command, half a
+    period of each secondary mode, and half periods of the first beyond order 2.
 
     Without secondary modes, the two-step command does so, and is returned. Raise `RefusedError` if
     no such command keeps the limits.
     """
     modes = request.material.modes
-    weak = [(x, y) for i, (x, y) in enumerate(zip(modes.ratios, modes.shares, strict=True))
-            if i not in modes.ringing]
+    weak = next(((x, y) for i, (x, y) in enumerate(zip(
+        modes.ratios, modes.shares, strict=True)) if i not in modes.ringing), None)
+    whole = (_SPAN * request.order - _LESS) * 0.5 * sum(
+        _half_period(request.material, x) for x in (request.state.stretch, request.target))
     request = _of_ringing(request)
     if not request.material.modes:
         return two_step(request)
@@ -73,7 +78,7 @@ def modal(request: MoveRequest) -> Move:
     reach = _BEYOND * _largest_change(request, holding)
     limits = min(request.load, holding) - reach, max(request.load, holding) + reach
     widest: Attempt = None
-    for found in _solutions(request, holding, weak):
+    for found in _solutions(request, holding, whole, weak):
         loads = [x.load for x in found[0]]
         if limits[0] <= min(loads) and max(loads) <= limits[1]:
             return Move(Code.MODAL, *found)
@@ -116,89 +121,89 @@ def _largest_change(request: MoveRequest, holding: float) -> float:
         abs(state.rate) * stiffness / request.frequency)
 
 
+def _half_period(material: NondimensionalParameters, stretch: float) -> float:
+    """
+    Return half the period about a stretch of a block that can only deform as it does at rest.
+
+    All modes contribute to its inertia (J. W. Strutt, Lord Rayleigh, The Theory of Sound, 1877),
+    as to the paper's model.
+    """
+    modes = material.modes
+    ratios = (1.0, *(x * stretch ** y for x, _, _, y, _ in modes.numbers))
+    inertia = sum(x / y ** 2 for x, y in zip(modes.at(stretch), ratios, strict=True))
+    return math.pi * math.sqrt(inertia) / float(law.natural_frequency(stretch, material.packed))
+
+
 def _solutions(
-        request: MoveRequest, holding: float, weak: Sequence[tuple[float, float]]
+        request: MoveRequest, holding: float, whole: float, weak: _Weak
 ) -> Iterator[tuple[tuple[Level, ...], float]]:
     """Yield commands that end at rest within the limits."""
-    guesses = (partial(_equal, weak=weak) if request.material.rest != 0.0
-               else _around_two_steps)
+    guesses = (_equal(request, holding, whole, weak) if request.material.rest != 0.0
+               else _around_two_steps(request, holding))
     before: tuple[float, ...] = ()
-    for wanted, loads in guesses(request, holding):
-        durations = tuple(_on_grid(x, request) for x in wanted)
-        if durations == before:
-            continue
-        before = durations
-        begins = [math.fsum(durations[:i]) for i in range(len(durations) + 1)]
-        template = heights([Level(*x) for x in zip(begins, (*loads, holding), strict=True)])
-        found = within_limits(solve(template, request, modes=True), request)
-        if found is not None:
-            yield found
+    for template in guesses:
+        times = tuple(template.times.tolist())
+        if times != before:
+            before = times
+            found = within_limits(solve(template, request, modes=True), request)
+            if found is not None:
+                yield found
 
 
 def _equal(
-        request: MoveRequest, holding: float, weak: Sequence[tuple[float, float]]
-) -> Iterator[_Guess]:
-    """Yield equal durations, and loads that change smoothly from the present one to the last."""
-    count = max(
-        _LEVELS * request.order, request.unknowns + 2 * len(request.material.modes.ratios))
-    far = bool(weak) and weak[0][0] >= _FAR
-    whole = (_BRISK if far else _SHORTER) * request.order * math.pi / request.frequency
-    hardware = request.delivery.lag + request.delivery.ramp(holding - request.load)
+        request: MoveRequest, holding: float, whole: float, weak: _Weak) -> Iterator[Template]:
+    """Yield levels of equal durations that rise smoothly from the present load to the last."""
+    modes, delivery = request.material.modes, request.delivery
+    count = max(_LEVELS, _MORE_LEVELS * request.order)
+    whole += delivery.lag + delivery.ramp(holding - request.load)
+    rise = holding - request.load
     for length in _LENGTHS:
-        shares = _smooth(length * whole / count, count, request, weak).tolist()
-        yield [(length * whole + hardware) / count] * count, [
-            request.load + (holding - request.load) * x for x in shares]
+        each, levels = length * whole / count, count
+        if delivery.period > 0.0:
+            each = max(math.floor(each / delivery.period), 1) * delivery.period
+            levels = max(
+                round(length * whole / each), request.unknowns + 2 * len(modes.ratios))
+        each = delivery.rounded(each)
+        found = _smooth(each, levels, request, weak)
+        if found is None:
+            continue
+        # A field that lags is one more condition.
+        free = np.concatenate([found[1:], np.eye(levels)[levels - request.unknowns + 2:]])
+        d_loads = np.zeros((levels + 1, len(free)))
+        d_loads[:-1] = free.T
+        yield Template(
+            each * np.arange(levels + 1.0), np.append(request.load + rise * found[0], holding),
+            np.zeros_like(d_loads), d_loads)
 
 
-def _smooth(
-        each: float, count: int, request: MoveRequest, weak: Sequence[tuple[float, float]]
-) -> Array:
+def _smooth(each: float, count: int, request: MoveRequest, weak: _Weak) -> Array | None:
     """
     Return a smooth rise from 0 to 1, in levels of a duration, after which all modes rest.
 
     This is in linear motion about the target. Of all such levels, they leave least on average if
-    frequencies have errors, and weak modes any frequency near their mean.
+    frequencies have errors, and weak modes any frequency near their mean. Each further row changes
+    one position or rate at the end, and as little else as possible. None if rounding prevents it.
     """
     packed, target, modes = request.material.packed, request.target, request.material.modes
     frequency = request.frequency
     damping = float(law.damping(target, packed) / law.mass(target, packed)) / (2.0 * frequency)
-    ringing = [(1.0, damping), *(
-        (ratio * target ** exponent, own) for ratio, _, own, exponent, _ in modes.numbers)]
-    fastest = max(x for x, _ in ringing)
-    mean, share = weak[0] if weak else (_UNKNOWN[0] * fastest, _UNKNOWN[1])
-    band = np.geomspace(min(_ABOVE * fastest, mean), _WIDE * mean, _BAND)
-    left = each * np.arange(-count, 1)
-
-    def effects(ratios: Array, dampings: Array) -> NDArray[np.complex128]:
-        damped = np.sqrt(np.maximum(1.0 - dampings ** 2, 0.0))
-        rates = frequency * ratios * (dampings + 1j * damped)
-        found: NDArray[np.complex128] = np.exp(np.outer(rates, left))
-        return found
-
-    def parts(effect: NDArray[np.complex128]) -> tuple[Array, Array]:
-        # By the free levels, and by the last one, which is 1; the first change starts at 0.
-        rows = np.concatenate([effect.real, effect.imag])
-        return rows[:, :-1] - rows[:, 1:], rows[:, -1]
-
-    rings = effects(*np.array(ringing).T)
-    bends: Array = _BENT * np.diff(np.eye(count + 4), 2, axis=0)
-    free, last = (np.concatenate(x) for x in zip(
-        (bends[:, 2:-2], bends[:, -2:].sum(axis=1)),
-        parts(_ERROR * frequency * np.outer(
-            [x * y for x, (y, _) in zip(modes.at(target), ringing, strict=True)], left) * rings),
-        parts(share / math.sqrt(_BAND) * effects(band, np.minimum(damping * band, 1.0))),
-        strict=True))
-    conditions, ends = parts(rings)
-    # Least squares with Lagrange multipliers; frequencies that coincide give equal conditions.
-    none = np.zeros((len(ends), len(ends)))
-    found: Array = np.linalg.lstsq(
-        np.block([[free.T @ free, conditions.T], [conditions, none]]),
-        np.concatenate([-free.T @ last, -ends]), rcond=None)[0][:count]
-    return found
+    shares = modes.at(target)
+    rings = [(1.0, damping, _ERROR * shares[0]), *(
+        (ratio * target ** exponent, own, _ERROR * share * ratio * target ** exponent)
+        for (ratio, _, own, exponent, _), share in zip(modes.numbers, shares[1:], strict=True))]
+    fastest = max(x for x, _, _ in rings)
+    mean, share = weak or (_UNKNOWN[0] * fastest, _UNKNOWN[1])
+    least = min(_ABOVE * fastest, _BELOW * mean)
+    band = least * (_WIDE * mean / least) ** _PLACES
+    others = np.stack([band, damping * band, np.full(_BAND, share / math.sqrt(_BAND))], axis=1)
+    found = np.empty((1 + 2 * len(rings), count))
+    solved = motion.smooth(
+        frequency * each, len(rings), np.concatenate([np.array(rings), others]), _BENT, found)
+    return found if solved else None
 
 
-def _around_two_steps(request: MoveRequest, holding: float) -> Iterator[_Guess]:
-    """Yield the durations and loads of a two-step command that is shaped for all other modes."""
+def _around_two_steps(request: MoveRequest, holding: float) -> Iterator[Template]:
+    """Yield the levels of a two-step command that is shaped for all other modes."""
     half, delivery = math.pi / request.frequency, request.delivery
     try:
         move = two_step(replace(
@@ -232,7 +237,9 @@ def _around_two_steps(request: MoveRequest, holding: float) -> Iterator[_Guess]:
             begin += duration
             ramp = delivery.ramp(loads[-1] - (loads[-2] if len(loads) > 1 else request.load))
             durations.append(max(duration, _MORE * ramp))
-        yield durations, loads
+        durations = [_on_grid(x, request) for x in durations]
+        begins = [math.fsum(durations[:i]) for i in range(len(durations) + 1)]
+        yield heights([Level(*x) for x in zip(begins, (*loads, holding), strict=True)])
 
 
 def _seen(request: MoveRequest) -> State:
