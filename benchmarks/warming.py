@@ -70,7 +70,8 @@ def block() -> ActuatorParameters:
 
 
 def warming(
-        way: str, *, stiffer: float = 0.0, duration: float = DURATION) -> list[Left]:
+        way: str, *, stiffer: float = 0.0, coefficients: float = 1.0,
+        duration: float = DURATION) -> list[Left]:
     """
     Run the moves.
 
@@ -80,6 +81,8 @@ def warming(
         What the planner knows, one of `WAYS`.
     stiffer : float
         Relative error of the shear modulus that the planner is given.
+    coefficients : float
+        Factor on all coefficients that the planner is given.
     duration : float
         Duration of the run in s.
 
@@ -93,6 +96,9 @@ def warming(
     known = {
         'ignored': Thermal(), 'measured and foreseen': truth.thermal,
         'foreseen': truth.thermal}.get(way, replace(truth.thermal, rise=0.0))
+    known = replace(known, **{
+        x: coefficients * getattr(known, x)
+        for x in ('shear_modulus', 'remanence', 'damping_coefficient')})
     feedback = way.endswith('feedback')
     device = SimulatedDevice(
         [SimulatedJoint(Setup(truth), errors=SensorErrors(_NOISE if feedback else 0.0))],
