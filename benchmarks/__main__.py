@@ -18,7 +18,7 @@ laboratories, for half an hour. laboratory tunes laboratories behind a serial bo
 of an hour; line makes cables, boards, amplifiers and sensors fail there, for two minutes. studies
 kills the workers of a study. rates measures how many plans per second studies compute, for about
 seven minutes. lockstep compares the kernel of batches with C. continuum plays commands on finite
-elements, for five minutes; compressible compares a compressible block with them, for three;
+elements, for eight minutes; compressible compares a compressible block with them, for three;
 predictions compares what plans predict there, for two; beam plays
 them on an exact rod, for three; beam-identification identifies
 recordings of this rod, for five.
@@ -181,6 +181,7 @@ def main(arguments: list[str] | None = None) -> int:
         from benchmarks import bench_continuum
 
         add(bench_continuum.compare(quick=options.quick))
+        add(bench_continuum.little_damped(quick=options.quick))
     if 'compressible' in names:
         from benchmarks import bench_compressible
 
