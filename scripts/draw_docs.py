@@ -147,7 +147,7 @@ def deliveries(path: Path) -> None:
                 [Setpoint(1.4, 20 * period)],
                 MoveRequest.of(MATERIAL, State(1.0, 0.0, 0.0), delivery=delivery))
             levels = segment.move.levels
-            rest = replace(levels[0], time=float(time[0]), load=holding)
+            rest = levels[0]._replace(time=float(time[0]), load=holding)
             switches, loads, slopes = np.array(ramps(
                 [rest, *levels], holding, 3.0, delivery.slew)[0]).T
             stretch, _ = simulate(switches, loads, time, MATERIAL, slopes=slopes)
