@@ -15,7 +15,7 @@ from hmsa.cli import main
 from hmsa.errors import BadInputError
 from hmsa.model import law
 from hmsa.model.actuators import Actuators, Setup
-from hmsa.model.continuum import mounted, spectrum
+from hmsa.model.continuum import mode_shapes, mounted, spectrum
 from hmsa.model.delivery import Delivery
 from hmsa.model.modes import BROAD, Modes
 from hmsa.model.moves import Level, Setpoint, State
@@ -38,6 +38,15 @@ def test_first_mode_of_the_cube_is_its_lame_mode():
     # Shear waves that reflect without conversion: pi/sqrt(2) for a half length of 1.
     found = spectrum(1.0, 'free')
     assert found.frequencies[found.first] == pytest.approx(math.pi / math.sqrt(2.0), rel=1e-4)
+
+
+def test_first_mode_of_the_cube_is_the_sum_of_its_lame_modes_that_the_load_excites():
+    # Those in both planes of the field, with a mean of 1 along the field on the face of the load.
+    points = np.random.default_rng(1).uniform(-1.0, 1.0, (40, 3))
+    (x, y, z), size = 0.5 * np.pi * points.T, 0.25 * np.pi
+    expected = size * np.column_stack([
+        -np.sin(x) * np.cos(z), -np.sin(y) * np.cos(z), (np.cos(x) + np.cos(y)) * np.sin(z)])
+    assert mode_shapes(1.0, 3, points)[0] == pytest.approx(expected, abs=1e-4)
 
 
 def test_slender_block_is_a_bar():

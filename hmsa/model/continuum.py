@@ -149,11 +149,15 @@ def mode_shapes(shape: float, count: int, points: Array) -> Array:
 
     """
     basis, _, squared, vectors = _solved(shape, 'free', 1.0, math.inf, math.inf)
-    strength = (vectors.T @ basis.load) ** 2 / squared
-    strong = np.sort(np.argsort(-strength)[:count])
+    forces, frequencies = vectors.T @ basis.load, np.sqrt(np.abs(squared))
+    # Vectors of one frequency are one mode: their sum that the load excites.
+    begins = np.flatnonzero(np.diff(frequencies, prepend=0.0) >= _TOGETHER * frequencies)
+    groups = np.split(np.arange(len(forces)), begins[1:])
+    strong = np.sort(np.argsort(-np.add.reduceat(forces ** 2 / squared, begins))[:count])
+    shapes = np.column_stack([
+        vectors[:, x] @ forces[x] / (forces[x] @ forces[x]) for x in (groups[i] for i in strong)])
     values = basis.at(np.asarray(points, dtype=np.float64))
-    found: Array = np.einsum('njc,jm->mnc', values, vectors[:, strong] / (
-        basis.load @ vectors[:, strong]))
+    found: Array = np.einsum('njc,jm->mnc', values, shapes)
     return found
 
 
