@@ -259,6 +259,8 @@ def test_a_file_without_anything_for_a_node_is_told_with_what_to_write(tmp_path)
         f'{file} has no parameters for /planner, which keeps its defaults: its sections are '
         '/left/planner, /plant, expected /planner: or /**:')
     assert not [*unread_files(words, ['/left/planner'])]
+    sentence, = unread_files(words, ['/right/planner', '/right/plant'])
+    assert 'for /right/planner and /right/plant, which keep their defaults: its' in sentence
     # Planner and plant of one process share a file.
     assert not [*unread_files(words, ['/planner', '/plant'])]
     for text in ('/**: {ros__parameters: {lead_time: 0.1}}', ': : :', 'a: &a {b: *a}'):

@@ -231,9 +231,10 @@ def unread_files(arguments: Sequence[str], nodes: Sequence[str]) -> Iterator[str
             continue  # which ROS 2 has read in its own way
         if not any(is_for(x, node) for x in found for node in nodes):
             keys = ' and '.join(f'{x}:' for x in nodes)
+            keep = 'keeps its' if len(nodes) == 1 else 'keep their'
             yield (
-                f'{path} has no parameters for {" and ".join(nodes)}, which keeps its defaults: '
-                f'its sections are {listed(found) or "none"}, expected {keys} or /**:')
+                f'{path} has no parameters for {" and ".join(nodes)}, which {keep} defaults: its '
+                f'sections are {listed(found) or "none"}, expected {keys} or /**:')
 
 
 def unknown(node: Node, name: str, others: Iterable[str] = ()) -> BadInputError:
