@@ -225,7 +225,7 @@ def test_once_waits_for_what_is_missing_and_says_so(start, ros_domain_id):
 
 
 @pytest.mark.parametrize(('words', 'said'), [
-    (['--timeout', '-1'], 'timeout is -1: expected 0 to'),
+    (['--timeout', '-1'], 'timeout is -1 s: expected 0 to'),
     (['--timeout', 'nan'], 'timeout is nan'),
     (['--namespace', '9 bad'], "namespace '9 bad'"),
 ])
