@@ -437,9 +437,13 @@ class RosSide:
         from rclpy.context import Context
         from rclpy.executors import SingleThreadedExecutor
         from rclpy.node import Node
+        from rclpy.parameter import Parameter
         self.context = Context()
         self.context.init(args=[], domain_id=domain_id)
-        self.node = Node('test', context=self.context, **node_options)
+        # Nobody asks it for parameters or types, and others need not discover these services.
+        self.node = Node('test', context=self.context, **{
+            'start_parameter_services': False, 'parameter_overrides': [
+                Parameter('start_type_description_service', value=False)], **node_options})
         self.executor = SingleThreadedExecutor(context=self.context)
         self.executor.add_node(self.node)
 

@@ -51,7 +51,8 @@ def test_what_nobody_answers_is_asked_again(ros, make_ros):
     assert found == [{parameter_key('/planner', 'lead_time'): '0.05'}]
 
 
-def test_a_parameter_without_a_value_hides_no_other(ros):
+def test_a_parameter_without_a_value_hides_no_other(make_ros):
+    ros = make_ros(start_parameter_services=True)
     ros.node.declare_parameter('density', 1900.0)
     # As a joint has that is one of several.
     ros.node.declare_parameter('left.density', Parameter.Type.DOUBLE)
