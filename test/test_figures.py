@@ -95,7 +95,7 @@ def printed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, str]:
         patch.chdir(tmp_path_factory.mktemp('work'))
         patch.setattr(paper_data, 'SAMPLES', POINTS)
         patch.setattr(paper_data, 'SWEEP_POINTS', POINTS)
-        assert main(['figures', '--dpi', '50']) == 0
+        assert main(['figures', '--dpi', '200']) == 0
         return Path('figures').absolute(), out.getvalue(), err.getvalue()
 
 
