@@ -310,8 +310,10 @@ def test_mounted_block_rests_by_modal_and_rings_by_two_step():
         state = State(target, load=levels[-1].load)
 
 
-@pytest.mark.parametrize('shaper', ['two_step', 'robust', 'smooth', 'zvd', 'minimum_time'])
-def test_plan_predicts_the_vibration_that_its_simulation_shows(shaper):
+@pytest.mark.parametrize(('shaper', 'modes'), [
+    ('two_step', [2, 2]), ('robust', [2, 2]), ('smooth', [2, 2]), ('zvd', [2, 2]),
+    ('minimum_time', [4, 2])])
+def test_plan_predicts_the_vibration_that_its_simulation_shows(shaper, modes):
     block = Actuator(half_length=5e-3, damping_ratio=0.05, mount='free', flux_density_limits=0.2)
     plan, before = block.plan([(1.05, 0.3), (0.97, 0.3)], shaper), 1.0
     seen = plan.simulate(rate=2e5)
@@ -322,7 +324,7 @@ def test_plan_predicts_the_vibration_that_its_simulation_shows(shaper):
         left = seen.stretches[(seen.times >= arrival) & (seen.times < arrival + period)]
         assert segment.left.vibration * abs(target - before) == pytest.approx(
             float(np.ptp(left)), rel=0.02)
-        assert segment.left.mode > 1
+        assert segment.left.mode == modes[i]
         assert f'by {segment.move.code} leaves a vibration of' in segment.notes()[-1]
         before = target
 
@@ -354,19 +356,41 @@ def test_modal_tells_of_weak_modes_alone_and_an_actuator_without_modes_of_nothin
     assert remaining(request, get_shaper('modal')(request)) is None
 
 
-def test_minimum_time_that_leaves_more_than_a_step_is_a_warning():
-    half = replace(BLOCK, modes=Modes((2.2,), (0.4,), (0.05,)))
-    weak, strong = (
-        Planner(x, Options(shaper='minimum_time', flux_density_min=-y, flux_density_max=y))
-        for x, y in ((BLOCK, 0.06), (half, 1.0)))
-    assert not weak.draft_setpoint(1.05, 0).segments[0].warns
-    draft = strong.draft_setpoint(1.05, 0)
-    assert draft.segments[0].warns
-    assert re.search(
-        r'1\.05 by minimum_time leaves a vibration of \d+ % .* an unshaped step \d+ %: expected '
-        'the shaper modal', draft.segments[0].told)
-    left = draft.segments[0].left
-    assert left.vibration > left.step > 0.5
+def vibration_of(plan, begin):
+    """Return the vibration that a simulation shows in a period from a time on, peak to peak."""
+    seen, block = plan.simulate(rate=2e5), plan.segments[0]
+    period = 2.0 * math.pi / plan.actuator.model.frequency(
+        block.setpoint.stretch) * plan.actuator.model.units.time
+    begin = 0.5 * period if begin is None else begin
+    return np.ptp(seen.stretches[(seen.times >= begin) & (seen.times < begin + period)])
+
+
+@pytest.mark.parametrize(('shape', 'mount', 'target', 'mild', 'strong'), [
+    (0.3, 'free', 1.1, 2.0, 4.0), (2.0, 'free', 1.1, 10.0, 30.0), (2.0, 'glued', 0.9, 10.0, 30.0),
+    (None, 'clamped', 0.3, 30.0, 100.0), *(pytest.param(*x, marks=pytest.mark.slow) for x in (
+        (0.1, 'free', 0.9, 4.0, 10.0), (4.0, 'free', 1.1, 10.0, 30.0)))])
+def test_minimum_time_warns_where_a_step_leaves_less(shape, mount, target, mild, strong):
+    """Limits of the coil are in units of the level that holds the target."""
+    with unquestioned():
+        actuator = Actuator.beam(
+            length=25e-3, thickness=1e-3, width=5e-3, youngs_modulus=1e6, density=2000.0,
+            damping_ratio=0.03, mount=mount) if shape is None else Actuator(
+            half_thickness=0.01 * shape, damping_ratio=0.05, chain_limit=5.0, mount=mount)
+    step = actuator.plan([(target, 0.5)], 'step')
+    by_step, held = vibration_of(step, None), abs(float(step.flux_densities[-1]))
+    for push, warned in ((mild, False), (strong, True)):
+        limit = push * held
+        with unquestioned():
+            wide = actuator.replace(flux_density_limits=limit)
+        plan = wide.plan([(target, 0.5)], 'minimum_time')
+        assert (vibration_of(plan, plan.move_times[0]) > by_step) == warned
+        segment, = Planner(actuator.block, Options(
+            shaper='minimum_time', flux_density_min=-limit, flux_density_max=limit,
+        )).draft_setpoint(target, 0).segments
+        assert segment.warns == warned
+        assert bool(re.search(
+            r'by minimum_time leaves a vibration of \d+ % .* an unshaped step \d+ %: expected '
+            'the shaper modal', segment.told)) == warned
 
 
 def test_damping_ratio_of_a_mounted_block_is_that_of_its_first_mode():
