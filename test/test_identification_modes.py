@@ -133,6 +133,26 @@ def test_modes_of_the_parameter_file_are_part_of_the_fit():
     assert abs(x.value - TRUE.shear_modulus) < 4.0 * x.std
 
 
+@pytest.mark.parametrize('modes', [
+    Modes((1.4,), (0.2,), (0.1,)), *(pytest.param(x, marks=pytest.mark.slow) for x in (
+        Modes((1.7, 2.6), (0.2, 0.06), (0.1, 0.15)), Modes((1.4, 2.6), (0.05, 0.06), (0.1, 0.15)),
+        Modes((3.0,), (0.1,), (0.1,))))])
+def test_modes_of_the_parameter_file_that_are_wrong_or_too_few_are_named(modes):
+    found = identify(recorded(), actuator=replace(TRUE, modes=modes))
+    assert found.verdict == 'model_rejected'
+    assert found.signatures[0].remedy == MODES
+    assert found.modes[0].ratio[0] == pytest.approx(1.4, rel=0.05)
+    assert found.modes[0].share[0] == pytest.approx(0.2, rel=0.1)
+    again = identify(recorded(), WITH_MODES, actuator=replace(TRUE, modes=modes))
+    assert again.verdict == 'identified', again.reason
+
+
+def test_a_defect_beside_right_modes_of_the_parameter_file_is_not_taken_for_modes():
+    found = identify(recorded(extras={'coil_time_constant': 1e-3}), actuator=TRUE)
+    assert found.verdict == 'model_rejected'
+    assert found.signatures[0].remedy == 'coil_time_constant'
+
+
 def test_a_mode_is_named_before_all_else_and_the_first_mode_is_shown():
     found = identify(recorded(), actuator=BLOCK)
     assert found.verdict == 'model_rejected'

@@ -42,7 +42,7 @@ _CERTAIN = 1e-4
 # number of standard deviations that is no chance.
 _ADVISED = (GAIN, 'sensor_latency', 'coil_time_constant', 'constant_force', *(
     x for names in quantities.BRANCHES for x in names))
-_RIVAL, _WORSE, _SURE = 0.5, 10.0, 3.0
+_RIVAL, _WORSE, _SURE = 0.7, 10.0, 3.0
 # Size of a mode in standard deviations that rejects a fit alone.
 _CLEAR = 8.0
 # Residuals along the elastica in units of those with the shape of the first mode, below which a
@@ -203,7 +203,7 @@ def _challenged(
             return replace(found, verdict='not_identifiable', reason=(
                 f'{GAIN} comes out as {gain.value:.4g}, and an error of the statics of the beam '
                 f'would look the same; calibrate the sensor, and give --known {GAIN}=VALUE+-STD'))
-    if quantities.modes_of(best.values):
+    if diagnosis.modal(best):
         return found
     lines, by_others = lines_of(best, diagnosis.frequency_of(best), 1, added)
     if not lines or lines[0].explained < _RIVAL * by_others:
@@ -212,7 +212,7 @@ def _challenged(
     values = {**best.values, **{
         x: quantities.QUANTITIES[x].default for x in added if x in quantities.QUANTITIES}}
     one = fit(best.recording, values, kept)
-    rival = None if one is None else with_modes(one, one.values, kept, limit)
+    rival = None if one is None else _with_others(one, limit, len(quantities.SECONDARY))
     if rival is None or not quantities.modes_of(rival.values):
         return found
     scale = min(best.scale, rival.scale)
@@ -298,10 +298,10 @@ def _conclude(
     if not found.white:
         marks = tuple(sorted(
             [*marks, *diagnosis.second_mode(best)], key=lambda x: (-x.found, -x.share)))
-        if one is None and not modes:
-            modes, named = _modes_left(
+        if one is None:
+            left, named = _modes_left(
                 best, marks, limit, bool(diagnosis.misfit(best, found, marks, alike)))
-            marks = (*named, *marks)
+            modes, marks = left or modes, (*named, *marks)
     distant = diagnosis.distant(best, found)
     # Where modes are what is missing, the values are those of the first.
     lost, weak = (set(best.free) if distant and not modes else set(), '') \
@@ -360,15 +360,17 @@ def _modes_left(
     Return the modes that residuals show more than any other departure, also as departures.
 
     A fit that is not rejected for other reasons needs stronger evidence of them. Residuals of
-    rounding, as a simulation without noise leaves, show none.
+    rounding, as a simulation without noise leaves, show none. Modes of the parameter file may be
+    wrong or too few.
     """
     if best.scale < RESOLVED * float(np.ptp(best.recording.stretch)):
         return (), []
     leading = max((x.share for x in marks if x.found and x.remedy), default=0.0)
-    lines, _ = lines_of(best, diagnosis.frequency_of(best), 1)
-    if not lines or lines[0].explained < leading:
-        return (), []
-    found = with_modes(best, best.values, best.free, limit, most=2)
+    if not quantities.modes_of(best.values):
+        lines, _ = lines_of(best, diagnosis.frequency_of(best), 1)
+        if not lines or lines[0].explained < leading:
+            return (), []
+    found = _with_others(best, limit, 2)
     part = explained(best, found)
     if not quantities.modes_of(found.values) or part < max(ENOUGH, leading):
         return (), []
@@ -381,6 +383,16 @@ def _modes_left(
         return (), []
     return modes, [Defect(x.words, part, size, True, quantities.MODES)
                    for x, size in zip(modes, sizes, strict=True)]
+
+
+def _with_others(one: Fit, limit: float, most: int) -> Fit:
+    """Return the best fit with secondary modes, in place of those that were given."""
+    given = [[one.values[x] for x in names] for names in quantities.modes_of(one.values)]
+    if given:
+        one = fit(one.recording, {
+            **one.values, **{x[1]: 0.0 for x in quantities.SECONDARY}}, one.free) or one
+    return with_modes(
+        one, one.values, one.free, limit, given, max(most, len(given) + 1))
 
 
 def _warnings(
