@@ -448,17 +448,23 @@ def learn(
         fit = _Fit(sequence, [trials[0], trial], noise, fit.found)
     slopes = sequence.derivatives(levels, trial.time, fit.found)
     size = float(np.ptp(np.append(levels, 0.0)))
-    # Regularisation by the ratio of the noise to the expected change.
+    # Regularisation by the ratio of the noise to the expected change, which falls with the
+    # residual: near the targets, hysteresis turns large changes into steady-state errors.
     weight = max(noise, 1e-7) / min(map(abs, sequence.steps)) / math.sqrt(
         len(residual) / len(targets)) / (_EXPECTED * size)
-    at_knots = np.linalg.lstsq(sequence.held, levels, rcond=None)[0]
+    first, last = (max(float(np.linalg.norm(x)), 1e-300) for x in (residuals[0], residual))
+    nearer = math.sqrt(first / last)
+    # The plan is made smooth, and what left less than it is changed smoothly.
+    bends = np.zeros(len(sequence.bends)) if best else sequence.bends @ np.linalg.lstsq(
+        sequence.held, levels, rcond=None)[0]
     change = np.linalg.lstsq(
-        np.vstack([slopes, weight * np.eye(slopes.shape[1]), _SMOOTH * weight * sequence.bends]),
-        np.concatenate([-residual, np.zeros(slopes.shape[1]),
-                        -_SMOOTH * weight * (sequence.bends @ at_knots)]), rcond=None)[0]
-    radius = _LARGEST * size * 0.5 ** (len(trials) - 1 - best)
-    change *= min(1.0, radius / max(float(np.max(np.abs(change))), 1e-300))
+        np.vstack([slopes, nearer * weight * np.eye(slopes.shape[1]),
+                   _SMOOTH * weight * sequence.bends]),
+        np.concatenate([-residual, np.zeros(slopes.shape[1]), -_SMOOTH * weight * bends]),
+        rcond=None)[0]
     failed = len(trials) - 1 - best
+    change *= 0.5 ** failed * min(
+        1.0, _LARGEST * size / max(float(np.max(np.abs(change))), 1e-300))
     if failed >= _FAILED:
         change *= 0.0
     frequencies = fit.frequencies
