@@ -27,8 +27,8 @@ from hmsa.motion import STRETCH
 from hmsa.planning.shapers import creeping, get_shaper
 from hmsa.planning.shapers.request import MoveRequest, Shaper, StepBudget
 
-# Samples of the first period after a move, and their tolerance.
-_SAMPLED, _RTOL = 100, 1e-7
+# Samples of the first period after a move, and their tolerance; that of a state that fades.
+_SAMPLED, _RTOL, _FADING_RTOL = 100, 1e-7, 1e-5
 _TIMES: Array = np.linspace(0.0, 1.0, _SAMPLED, dtype=np.float64)
 # Vibration in fractions of the move below which nothing is told, and from which another shaper is
 # advised; and that which an unshaped step leaves at least, so that only then it is computed.
@@ -115,7 +115,8 @@ def _fading(
     material, target = request.material, request.target
     try:
         found = sampled(
-            levels, request.start, np.array([start]), material, request.delivery, _RTOL)[:, 0]
+            levels, request.start, np.array([start]), material, request.delivery,
+            _FADING_RTOL)[:, 0]
     except HmsaError:
         return None
     state = found[motion.FOLLOWED + len(material.branches):]
