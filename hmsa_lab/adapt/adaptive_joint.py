@@ -58,7 +58,7 @@ _LOOK = 3.0
 _OFF, _LEAST, _FOLLOWED = 0.05, 0.01, 3.0
 # Log odds from which the sensor counts as changed, and part of the possible log odds against a
 # change from which it counts as before; a drift of 1e-2 a second reaches 0.73.
-_JUMPED, _AS_BEFORE = 5.0, 0.8
+_JUMPED, _AS_BEFORE = 2.0, 0.8
 # Number of samples kept to be explained anew.
 _KEPT = 600
 # Difference in K of an estimated temperature that plans follow; 2e-4 of a level.
