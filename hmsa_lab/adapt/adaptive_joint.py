@@ -16,8 +16,8 @@ from hmsa.model.units import flux_text, NANOSECONDS
 from hmsa.offload import Awaited, Doing
 from hmsa.planning.planner import Believed, Planner
 from hmsa.planning.timeline import JointModel, Timeline
-from hmsa_lab.adapt.choice import clearly_better
 from hmsa_lab.adapt.estimator import Estimator, EstimatorOptions, StateEstimate
+from hmsa_lab.adapt.expected_error import clearly_better
 from hmsa_lab.adapt.learnt import (
     as_of_path,
     differs,
