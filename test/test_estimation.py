@@ -202,7 +202,7 @@ def test_an_identified_covariance_is_the_prior(tmp_path):
 
 
 @pytest.mark.parametrize(('value', 'word'), [
-    ('[144.0, 0.0, 0.0]', '3 numbers for 2 names'), ('[1.0, 2.0, 2.0, 1.0]', 'is not one'),
+    ('[144.0, 0.0, 0.0]', '3 numbers for 2 names'), ('[1.0, 2.0, 2.0, 1.0]', 'not a covariance'),
     ('[1.0, 0.0, 0.0, .nan]', 'expected 4 finite'), ('[1.0, 0.0, 0.0, x]', 'expected numbers')])
 def test_a_covariance_that_is_none_is_refused(tmp_path, value, word):
     path = tmp_path / 'block.yaml'
