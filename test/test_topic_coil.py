@@ -145,7 +145,8 @@ BAD = (
 
 
 @pytest.mark.ros
-def test_a_field_that_takes_no_level_is_refused(ros):
+def test_a_field_that_takes_no_level_is_refused(ros, monkeypatch):
+    monkeypatch.setattr('hmsa_lab.nodes.topic_coil._BARE', 0.2)
     ros.collect(VECTOR, '/poses')
     ros.collect(ARRAY, '/coils')
     for settings, text in BAD:

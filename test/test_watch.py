@@ -209,6 +209,7 @@ def test_lines_follow_a_real_run_until_a_signal(start):
 
 
 @pytest.mark.ros
+@pytest.mark.long
 def test_once_waits_for_what_is_missing_and_says_so(start, ros_domain_id):
     start.hmsa('plant', '--ros-args', '-p', 'joint:=finger')
     once = start.hmsa('watch', '--once', '--timeout', '10')
