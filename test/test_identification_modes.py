@@ -168,6 +168,19 @@ def test_a_mode_is_named_before_all_else_and_the_first_mode_is_shown():
     assert found.record()['modes'][0]['ratio'] == mode.ratio
 
 
+def test_a_large_mode_that_changes_with_the_stretch_is_named_and_asks_for_smaller_steps():
+    known = replace(BLOCK, damping_coefficient=0.24)
+    recording = recorded(replace(
+        known, mass_factor=1.24, transverse_mass_factor=2.5, modes=Modes(
+            (1.36,), (0.4,), (0.05,), exponents=(0.7,), share_exponents=(-8.0,))), count=5)
+    plain = identify(recording, actuator=known)
+    assert plain.signatures[0].remedy == MODES
+    assert plain.reason.endswith('try --free +modes')
+    found = identify(recording, WITH_MODES, actuator=known)
+    assert found.verdict == 'model_rejected'
+    assert 'record steps half as large' in found.reason
+
+
 def test_without_modes_none_is_found():
     found = identify(recorded(replace(BLOCK, mass_factor=1.3)), WITH_MODES, actuator=BLOCK)
     assert found.verdict == 'identified', found.reason
@@ -176,7 +189,8 @@ def test_without_modes_none_is_found():
 
 
 @pytest.mark.parametrize(('extras', 'words'), [
-    ({'viscoelastic_ratio': 0.1}, 'creep'), ({'stretch_gain': 0.97}, 'stretch_gain')])
+    ({'viscoelastic_ratio': 0.1}, 'creep'), ({'stretch_gain': 0.97}, 'stretch_gain'),
+    ({'coil_time_constant': 3e-3}, 'sensor_latency')])
 def test_defects_are_not_taken_for_modes(extras, words):
     found = identify(recorded(BLOCK, extras=extras), actuator=BLOCK)
     assert found.verdict == 'model_rejected'

@@ -273,6 +273,12 @@ def misfit(
         f'{float(autocorrelation(fit.residual * fit.root)[1]):.2f} from one sample '
         f'to the next (white with a probability of {found.p_value:.2g})')
     if distant(fit, found) and not any(x.remedy == quantities.MODES for x in seen):
+        if tolerant and quantities.modes_of(fit.values) and not _remedy(seen):
+            name = fit.recording.coordinate.name
+            return (
+                f'secondary modes leave {unexplained(fit):.1%} of the recorded motion, more than '
+                f'{TOLERATED:.0%}: those of a continuum change with the {name}; record steps half '
+                'as large, and if they leave as much, check units, clock and --params-file')
         return (
             f'the model cannot reproduce the recorded motion: {figures}, against a motion of '
             f'{motion:.3g} rms; check that times are in s and levels in tesla, of one clock and '

@@ -366,12 +366,19 @@ def _modes_left(
     if best.scale < RESOLVED * float(np.ptp(best.recording.stretch)):
         return (), []
     leading = max((x.share for x in marks if x.found and x.remedy), default=0.0)
-    if not quantities.modes_of(best.values):
+    distant = diagnosis.distant(best, whiteness(best.root * best.residual))
+    if not quantities.modes_of(best.values) and not distant:
         lines, _ = lines_of(best, diagnosis.frequency_of(best), 1)
         if not lines or lines[0].explained < leading:
             return (), []
     found = _with_others(best, limit, 2)
     part = explained(best, found)
+    if distant and part >= ENOUGH:
+        # Directions hold only near the motion: compare fits.
+        leading = max((
+            explained(best, y) for x in dict.fromkeys(x.remedy for x in marks if x.remedy)
+            if (y := fit(best.recording, best.values, (*best.free, *x.split(',')))) is not None),
+            default=0.0)
     if not quantities.modes_of(found.values) or part < max(ENOUGH, leading):
         return (), []
     weighted = found.root * found.residual
