@@ -427,6 +427,8 @@ def test_a_plan_is_a_sequence_of_its_levels_and_a_table_one_of_its_rows(block):
     # Its slices are levels that can be simulated.
     assert block.simulate(plan[:2], until=0.4).stretches[-1] == pytest.approx(1.1, abs=1e-6)
     assert plan[2].time == plan.setpoints[0, 1]  # to the last digit
+    taken = plan.segments[0].move.duration * block.model.units.time
+    assert plan.times[1] == plan.move_times[0] == pytest.approx(taken, rel=1e-14)
     table = plan.report()
     assert [x['status'] for x in table] == table['status']
     assert (table[1], table[1:]['stretch']) == (table.records()[1], [1.0])

@@ -15,7 +15,6 @@ from hmsa.api.motion import Motion, simulated
 from hmsa.errors import BadInputError, excerpt
 from hmsa.model.equations import Array
 from hmsa.model.status import Code
-from hmsa.model.units import DECIMALS
 from hmsa.planning.sequence import Segment
 from hmsa.runs.record import read_only
 from hmsa.runs.tables import UNITS, write_table
@@ -98,7 +97,7 @@ class Plan:
                      if last or x.time < segment.setpoint.span]
         times, loads = np.array(rows).T
         return read_only(np.column_stack([
-            np.round(times * units.time, DECIMALS), units.level(loads)]))
+            [units.duration(x) for x in times.tolist()], units.level(loads)]))
 
     @property
     def times(self) -> Array:
@@ -126,8 +125,8 @@ class Plan:
     @property
     def move_times(self) -> Array:
         """Move times in s; infinite where a target is only approached, shape (n,)."""
-        times = np.array([x.move.duration for x in self.segments])
-        return read_only(np.round(times * self.actuator.model.units.time, DECIMALS))
+        units = self.actuator.model.units
+        return read_only(np.array([units.duration(x.move.duration) for x in self.segments]))
 
     def __len__(self) -> int:
         return len(self.levels)

@@ -326,16 +326,12 @@ def _errors(arguments: argparse.Namespace) -> list[float] | None:
 def _si_row(
         segment: 'Segment', units: 'Units', per_ampere: float | None) -> dict[str, Any]:
     """Return a segment with times in s, flux densities in T and any currents in A."""
-    from hmsa.model.units import DECIMALS
-
     row = _row(segment)
-    levels = [[round(x.time * units.time, DECIMALS), units.level(x.load)]
-              for x in segment.move.levels]
+    levels = [[units.duration(x.time), units.level(x.load)] for x in segment.move.levels]
     first, last = levels[0][1] if segment.shaped else None, units.level(segment.held)
     row |= {
         'span': units.duration(row['span']),
-        'time_p': None if row['tau_p'] is None else round(
-            row['tau_p'] * units.time, DECIMALS),
+        'time_p': None if row['tau_p'] is None else units.duration(row['tau_p']),
         'flux_density_p': first, 'flux_density_1': last, 'levels': levels}
     if per_ampere is not None:
         row |= {'current_p': None if first is None else first / per_ampere,

@@ -5,8 +5,6 @@ from typing import Any
 
 #: Nanoseconds in a second; times that must not drift are integer nanoseconds.
 NANOSECONDS = 1_000_000_000
-#: Decimals of a time in s to the nanosecond.
-DECIMALS = 9
 #: Vacuum permeability in H/m (CODATA 2022); SciPy's table of constants takes 0.2 s to load.
 MU_0 = 1.25663706127e-6
 
@@ -27,7 +25,7 @@ class Units:
     coordinate: str = 'stretch'  #: name of a position
 
     def duration(self, value: float) -> float:
-        """Return a dimensionless duration in the unit of time, to 15 digits, as it was given."""
+        """Return a dimensionless time in the unit of time, to 15 digits: 0.5 if 0.5 was given."""
         return float(f'{value * self.time:.15g}')
 
     def level(self, load: Any) -> Any:
