@@ -121,7 +121,8 @@ def _fading(
         return None
     state = found[motion.FOLLOWED + len(material.branches):]
     modes, times = material.modes, duration * _TIMES
-    whole, rows = np.full(_SAMPLED, target), [np.full(_SAMPLED, target)] * (1 + len(modes.ratios))
+    whole: Array = np.full(_SAMPLED, target)
+    rows = [whole] * (1 + len(modes.ratios))
     for i, ((ratio, _, damping, exponent, _), share) in enumerate(zip(
             modes.numbers, modes.at(target)[1:], strict=True)):
         if i in modes.ringing:

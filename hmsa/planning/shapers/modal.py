@@ -171,9 +171,10 @@ def _equal(
         free = np.concatenate([found[1:], np.eye(levels)[levels - request.unknowns + 2:]])
         d_loads = np.zeros((levels + 1, len(free)))
         d_loads[:-1] = free.T
+        times = each * np.arange(levels + 1, dtype=np.float64)
         yield Template(
-            each * np.arange(levels + 1.0), np.append(request.load + rise * found[0], holding),
-            np.zeros_like(d_loads), d_loads)
+            times, np.append(request.load + rise * found[0], holding), np.zeros_like(d_loads),
+            d_loads)
 
 
 def _smooth(each: float, count: int, request: MoveRequest, weak: _Weak) -> Array | None:
