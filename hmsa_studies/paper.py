@@ -25,9 +25,10 @@ TAU_P = style.axis('time of first level', r'\tau_p')
 PAPER_CRITICAL = 2.14
 _COMMANDS = (('unshaped', style.UNSHAPED), ('shaped', style.SHAPED))
 _ALONE = looks.LineStyle(looks.INDIGO, 1.2, (6.0, 1.5, 1.0, 1.5)).line()
+# The first is broad: those on it remain visible where all coincide.
 _CASES = (
-    looks.LineStyle(looks.BLUE, 1.0), looks.LineStyle(looks.ORANGE, 1.5, (5.0, 1.5), order=3),
-    looks.LineStyle(looks.BLACK, 1.2, (1.0, 1.2), order=4))
+    looks.LineStyle(looks.BLUE, 2.0), looks.LineStyle(looks.ORANGE, 1.4, (4.0, 3.0), order=3),
+    looks.LineStyle(looks.BLACK, 1.0, (1.0, 2.0), order=4))
 # Width in inches below which panels are stacked.
 _NARROW = 4.0
 
