@@ -114,8 +114,8 @@ def pytest_runtest_makereport(
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
-    """Return three workers for each core, since a test with nodes mostly waits for them."""
-    return 3 * (os.cpu_count() or 1)
+    """Return two workers for each core, since a test with nodes mostly waits for them."""
+    return 2 * (os.cpu_count() or 1)
 
 
 @pytest.hookimpl(wrapper=True)
