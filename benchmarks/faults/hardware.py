@@ -340,7 +340,7 @@ FAULTS.fault(
     'driver_planner_stalled', 'planner stopped for longer than command_timeout',
     f'SIGSTOP for {_STALL:g} s in mid-sequence, SIGCONT; a board on a serial line',
     'off within command_timeout of the last heartbeat, and until a request; status `cut_off`')(
-        lambda rig: _stalled(rig, 'planner', _TIMEOUT + 0.1))
+        lambda rig: _stalled(rig, 'planner', _TIMEOUT + 0.4))
 FAULTS.fault(
     'driver_stalled', 'driver stopped for longer than command_timeout',
     f'SIGSTOP for {_STALL:g} s in mid-sequence, SIGCONT; a board on a serial line',
