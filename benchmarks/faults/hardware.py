@@ -326,6 +326,8 @@ def _stalled(rig: Rig, who: str, latest: float) -> Seen:
         rig.spin(_STALL)
         processes[who].send(signal.SIGCONT)
         rig.spin_until(lambda: any(x['code'] == CUT_OFF for x in rig.verdicts), 'the status')
+        # The board reads the level after the driver has written it.
+        rig.spin_until(lambda: bench.board.off_since(begin) < math.inf, 'the coil to be off')
         off = bench.board.off_since(begin)
         rig.spin(1.0)
         again = bench.board.largest_since(begin + off)
