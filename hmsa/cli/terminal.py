@@ -57,7 +57,7 @@ class _Teller:
         self._thread = threading.Thread(target=self._wait, daemon=True)
 
     def start(self) -> None:
-        """Begin to tell of the activities."""
+        """Start the thread."""
         self._thread.start()
 
     def end(self) -> None:
@@ -103,10 +103,10 @@ _tellers: list[_Teller] = []
 @contextmanager
 def under_way(words: str = '') -> Iterator[Callable[[str], None]]:
     """
-    Have it said what is under way, again and again; yield a function that changes the words.
+    Print what is under way at intervals; yield a function that changes the words.
 
-    Within another activity it takes its place until its end. Without words nothing is said, as
-    where a command talks itself.
+    An activity within another one takes its place until it ends. Without words nothing is printed:
+    the command prints its own lines.
     """
     own = not _tellers
     if own:
