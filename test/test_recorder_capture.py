@@ -70,6 +70,21 @@ def test_a_subscription_is_replaced_without_a_loss(ros, start, wait_until):
     assert [sequence for *_, sequence, _ in got] == list(range(got[0][3], got[0][3] + 1500))
 
 
+def test_messages_of_a_publisher_keep_their_order_when_one_had_to_be_sent_again():
+    topic = RecordedTopic('/a', 'std_msgs/msg/Float64', 0, None, ())
+
+    def log_times(*messages):
+        batch, _ = topic.take([(0, *message, b'') for message in messages], None, paused=False)
+        return [log_time for _, log_time, *_ in batch]
+
+    # The second message of 'a' was received last, and held back its third.
+    assert log_times((10, 1, b'a'), (40, 2, b'a'), (20, 3, b'a'), (30, 1, b'b')) == [
+        10, 40, 40, 30]
+    assert log_times((30, 4, b'a'), (50, 5, b'a')) == [40, 50]
+    topic.begin_anew()
+    assert log_times((5, 6, b'a')) == [5]
+
+
 @pytest.mark.parametrize('largest', [
     (100,) * 50, (60_000,) * 6, (60_000,) * 200, (100, 3_000, 10**7)])
 def test_the_queues_of_all_topics_stay_within_their_share_of_the_memory(largest, monkeypatch):

@@ -26,6 +26,7 @@ class RecordedTopic:
     offered: tuple[Qos, ...]  #: by its publishers
     publishers: int = 0  #: at the last look
     last: dict[bytes, int] = field(default_factory=dict)  #: sequence number by publisher
+    latest: dict[bytes, int] = field(default_factory=dict)  #: reception in ns by publisher
     received: int = 0
     largest: int = 0  #: payload so far, in bytes
     missed: int = 0  #: gaps in the sequence numbers
@@ -35,6 +36,10 @@ class RecordedTopic:
     def latched(self) -> bool:
         """Return whether a publisher may send its last messages to late subscribers."""
         return any(x.durability == 'transient_local' for x in self.offered)
+
+    def begin_anew(self) -> None:
+        """Accept reception timestamps before the latest ones: the clock was set back."""
+        self.latest.clear()
 
     def take(
             self, messages: Iterable[tuple[int, int, int, bytes, bytes]],
@@ -57,8 +62,10 @@ class RecordedTopic:
             self.last[publisher] = sequence
             if paused:
                 continue
-            # Not every middleware provides reception timestamps.
-            stamp = received or time.time_ns()
+            # Not every middleware provides reception timestamps. A message that had to be sent
+            # again is received after its successors, which are delivered only then.
+            stamp = max(received or time.time_ns(), self.latest.get(publisher, 0))
+            self.latest[publisher] = stamp
             batch.append((self.number, stamp if at is None else at(stamp), source, sequence, data))
             size += len(data)
         self.received += len(batch)

@@ -220,6 +220,8 @@ class Recorder(ManagedNode):
         earlier, rest = _parted(taken, partial(lt, now))
         for key, messages in earlier:
             self._take_in(key, messages)
+        for topic in list(self._recorded.topics.values()):
+            topic.begin_anew()
         # Within a file, log times rise.
         self.get_logger().warning(
             f'the clock of this host was set back by {-by / NANOSECONDS:.3f} s: recording '
