@@ -155,7 +155,7 @@ COMMANDS = {
             'bag', 'compare', 'completion', 'export', 'identify', 'init', 'plan', 'report',
             'simulate')}, 'wave': 'waves'},
     'hmsa_ros.cli': {
-        **{x: x for x in ('demo', 'param', 'run', 'send', 'stop')},
+        **{x: x for x in ('demo', 'interlock', 'param', 'run', 'send', 'stop')},
         **{node: 'node' for node, package in NODES.items() if package == 'hmsa_ros'}},
     'hmsa_lab.cli': {
         **{x: x for x in ('calibrate', 'excite', 'learn', 'panel', 'sense', 'tune', 'watch')},

@@ -23,7 +23,7 @@ from hmsa_ros.middleware import fast_dds
 
 ROOT = Path(__file__).resolve().parent.parent
 # Those that start no processes: a demo in a fork, interrupted, ends with a segmentation fault.
-COMMANDS = (*registered(NODES), 'send', 'stop', 'param', 'watch')
+COMMANDS = (*registered(NODES), 'send', 'stop', 'interlock', 'param', 'watch')
 # With Fast DDS 3 a fork that has two contexts ends with a segmentation fault.
 SAFE = fast_dds() == 2
 # Variables that a process reads while it starts and imports: with others it is no fork.

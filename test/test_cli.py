@@ -274,6 +274,7 @@ def test_a_command_says_what_it_does_from_its_start_on(name, capsys, wait_until,
                      'calibrate': ['coil', 'lab:Coil', '--limit', '1'],
                      'check-driver': ['lab:Coil'], 'compare': ['run'], 'completion': ['bash'],
                      'export': ['run', '--out', 'run.csv'], 'identify': ['run'],
+                     'interlock': ['open'],
                      'learn': ['run'], 'plan': ['1.1:1'], 'report': ['run'], 'run': ['1.1:1'],
                      'send': ['1.1:1'], 'simulate': ['levels.csv'], 'tune': ['1.1:1'],
                      'wave': ['sine', '--frequency', '1', '--amplitude', '0.1']}.get(name, [])]

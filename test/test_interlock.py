@@ -207,7 +207,7 @@ def test_a_planner_drops_its_plan_refuses_and_waits_to_be_asked(reaction, monkey
     verdict = rig.runtime.request(StretchRequest('a', 1.3))
     assert verdict.code == 'interlock'
     assert verdict.message.endswith(
-        'close the interlock (~/interlock of the driver), then send a new request')
+        'close the interlock (hmsa interlock close), then send a new request')
     assert rig.runtime.request(Stop()).code != 'interlock'
     rig.run(rig.now + 1000 * MS)
     rig.door = False
@@ -320,3 +320,30 @@ def test_an_interlock_stays_open_while_a_driver_is_configured_anew(start, ros, t
     health.clear()
     ros.spin_until(shown, 'a driver that is there again')
     assert shown() == ['open: a publisher has opened it']
+
+
+@pytest.mark.ros
+def test_a_command_opens_and_closes_the_interlock_of_a_driver(start, ros, tmp_path):
+    (tmp_path / 'lab.py').write_text(BENCH)
+    health = ros.collect(topics.DIAGNOSTICS.type, topics.DIAGNOSTICS.name)
+    for namespace, required in (('left', 'false'), ('right', 'true')):
+        start.hmsa(
+            'driver', '--ros-args', '-r', f'__ns:=/{namespace}', '-p', 'hardware:=lab:Coil',
+            '-p', 'publish_rate:=0.0', '-p', f'interlock_required:={required}',
+            PYTHONPATH=str(tmp_path))
+
+    def turn(state, namespace, status, said, timeout=60):
+        command = start.hmsa(
+            'interlock', state, '--namespace', namespace, '--timeout', str(timeout))
+        assert command.wait() == status
+        assert said in (command.stderr if status else command.stdout)
+
+    turn('close', 'left', 0, 'interlock closed: the next request moves the actuator again')
+    turn('open', 'left', 0, 'interlock open: the driver switches the coil off')
+    health.clear()
+    ros.spin_until(lambda: health and any(
+        x.message == 'open: a publisher has opened it' for y in health for x in y.status),
+        'an interlock that stays open without its publisher')
+    turn('close', 'left', 0, 'interlock closed')
+    turn('close', 'right', 1, '/right/driver has interlock_required: it opens again')
+    turn('open', 'middle', 1, 'no driver /middle/driver', timeout=1)

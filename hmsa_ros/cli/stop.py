@@ -4,7 +4,7 @@ Drop the rest of the sequence and come to rest without vibration.
 Have the running planner drop the rest of its sequence and bring the actuators to rest without
 vibration. Succeed once the plant or driver has acknowledged the stop and its samples, if any, do
 not contradict it. Otherwise fail, and print the state and the remedy. The field stays on: in an
-emergency, open the interlock of the driver (topic driver/interlock), or switch the amplifier off.
+emergency, run hmsa interlock open, or switch the amplifier off.
 
 example: hmsa stop
 """

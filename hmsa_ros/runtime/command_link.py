@@ -241,7 +241,7 @@ class CommandLink:
         return RefusedError(
             Code.INTERLOCK, f'the interlock of the driver of joint {joint} is open, or its '
             'hardware is out of reach (see /diagnostics), so the coil is off: close the interlock '
-            '(~/interlock of the driver), then send a new request')
+            '(hmsa interlock close), then send a new request')
 
     def check(self, joints: Iterable[str]) -> None:
         """
