@@ -7,7 +7,7 @@ import pytest
 
 from hmsa.errors import BadInputError
 from hmsa.model.law import elastic_energy, elastic_force, elastic_stiffness, pack
-from hmsa.model.laws.formula import exp, expm1, law_of, log, log1p
+from hmsa.model.laws.formula import _EXP, _LOG, _PART, exp, expm1, law_of, log, log1p
 from hmsa.model.laws.record import Constant
 
 MODULUS, EXPONENT = Constant('law.mu', 'modulus'), Constant('law.n', 'exponent', '', above=0.0)
@@ -40,6 +40,23 @@ def test_force_and_stiffness_are_derivatives_of_the_energy(energy):
         assert elastic_stiffness(stretch, packed) == pytest.approx(
             series.deriv(2)(0.0), rel=1e-7)
     assert modulus > 0.0
+
+
+def test_force_takes_one_logarithm_and_one_exponential_for_both_stretches():
+    _, elastic = law(lambda strain, mu, n: mu * strain.over_stretches(
+        lambda x: x ** n / n - log(x))).scaled(VALUES)
+    known, fixed, force, _ = map(int, elastic.constants[:4])
+    begin = 4 + known + fixed
+    operations = [int(x) // _PART ** 2 for x in elastic.constants[begin:begin + force]]
+    assert [operations.count(x) for x in (_LOG, _EXP)] == [1, 1]
+
+
+def test_energy_and_force_are_nan_where_a_logarithm_has_no_value():
+    _, elastic = law(lambda strain, mu, n: -mu * log(1.0 - n * strain.first)).scaled(VALUES)
+    packed = pack(0.1, math.inf, 2.0, elastic)
+    for of in (elastic_force, elastic_stiffness, elastic_energy):
+        assert [math.isnan(of(x, packed)) for x in (-1.0, 0.5, 1.0, 1.3, 1.6)] == [
+            True, True, False, False, True]
 
 
 def test_a_constant_outside_an_open_range_is_refused():

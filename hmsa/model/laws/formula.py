@@ -9,6 +9,7 @@ programs that the compiled equation of motion runs over its scalars (``Formula``
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 import math
 from typing import Any, Union
 
@@ -23,13 +24,15 @@ from hmsa.model.laws.record import (
     positive_modulus,
 )
 
-# Operations of a program; the first is none.
-_LEAF, _SUM, _PRODUCT, _INVERSE, _POSITIVE, _LOG, _LOG1P, _EXP, _EXPM1, _POWER = range(10)
-# Numbers that the motion provides, and their derivatives by the stretch: stretch along the field
-# and across it, I1 - 3 and I2 - 3, and the derivatives of the last two.
-_GIVEN = 6
-# Registers of the compiled motion.
-_MOST = 96
+# Operations of a program; the first is none. Two of them also have a form with a constant.
+(_LEAF, _SUM, _SUM_FIXED, _PRODUCT, _PRODUCT_FIXED, _INVERSE, _DEFINED, _LOG, _LOG1P, _EXP,
+ _EXPM1) = range(11)
+# Numbers that the motion provides: stretch along the field and across it, the inverse of the
+# first, I1 - 3 and I2 - 3, and the derivatives of these two by the stretch.
+_GIVEN = 7
+# Registers of the compiled motion, and the factor between operation and registers in a step, which
+# is one number.
+_MOST, _PART = 96, 128
 # Largest power that is a product.
 _SMALL = 4
 
@@ -42,13 +45,23 @@ class _Program:
     def __init__(self, constants: int) -> None:
         self.constants = constants
         self.steps: list[tuple[int, Any, Any]] = []
+        #: By step (`Term.rank`).
+        self.ranks: list[int] = []
         self._places: dict[tuple[int, Any, Any], int] = {}
         self.leaves = [self.term(_LEAF, f'{i}') for i in range(constants + _GIVEN)]
+        #: Factor and exponential of the first exponential of a multiple of a term.
+        self.exponentials = dict[Term, tuple[float, Term]]()
+        self.along, self.across, inverse = self.leaves[constants:constants + 3]
+        self.inverses = {
+            self.along: inverse, inverse: self.along, self.across: self.along * self.across}
 
     def term(self, operation: int, a: Any, b: int | None = None) -> 'Term':
         step = (operation, a, a if b is None else b)
         if step not in self._places:
             self._places[step] = len(self.steps)
+            self.ranks.append(
+                max(1, *(self.ranks[x] for x in step[1:])) if operation != _LEAF
+                else 0 if isinstance(a, float) else 1 if int(a) < self.constants else 2)
             self.steps.append(step)
         return Term(self, self._places[step])
 
@@ -56,60 +69,61 @@ class _Program:
         return value if isinstance(value, Term) else self.term(_LEAF, float(value))
 
     def slope(self, of: 'Term') -> 'Term':
-        """Return the derivative of a term by the stretch."""
-        along, across, _, _, by_first, by_second = self.leaves[self.constants:]
+        """Return the derivative of a term by the stretch; NaN where the term has no value."""
+        along, across, inverse, _, _, by_first, by_second = self.leaves[self.constants:]
         slopes: dict[int, Number] = dict(enumerate(
-            (1.0, -0.5 * across ** 3, by_first, by_second), self.constants))
-        for i, (operation, a, b) in enumerate(self.steps[:of.place + 1]):
+            (1.0, -0.5 * inverse * across, -(inverse * inverse), by_first, by_second),
+            self.constants))
+        positive = dict[Term, None]()
+        for i in sorted(self._needed(of.place)):
+            operation, a, b = self.steps[i]
             if operation == _LEAF:
                 slopes.setdefault(i, 0.0)
                 continue
-            x, y, by, other = Term(self, a), Term(self, b), slopes[a], slopes[b]
+            here, x, y, by, other = (
+                *(Term(self, j) for j in (i, a, b)), slopes[a], slopes[b])
             if operation == _SUM:
                 slopes[i] = by + other
             elif operation == _PRODUCT:
                 slopes[i] = by * y + x * other
-            elif operation == _POWER:
-                slopes[i] = Term(self, i) * (by * y / x + log(x) * other)
+            elif operation == _INVERSE:
+                slopes[i] = by * (-here * here)
+            elif operation in (_EXP, _EXPM1):
+                slopes[i] = by * exp(x)
             else:
-                slopes[i] = by * {
-                    _INVERSE: lambda here, x: -here * here,
-                    _LOG: lambda _, x: 1.0 / x.positive(),
-                    _LOG1P: lambda _, x: 1.0 / (1.0 + x).positive(),
-                    _EXP: lambda here, _: here,
-                    _EXPM1: lambda here, _: here + 1.0}[operation](Term(self, i), x)
-        return self.literal(slopes[of.place])
+                inside = x if operation == _LOG else 1.0 + x
+                slopes[i] = by / inside
+                if inside != along and inside.rank == 2:
+                    positive[inside] = None
+        found = self.literal(slopes[of.place])
+        for each in positive:
+            found = self.term(_DEFINED, found.place, each.place)
+        return found
 
-    def packed(self, energy: 'Term', values: tuple[float, ...]) -> tuple[float, ...]:
-        """Return the constants of the family for values of the constants."""
+    def compiled(self, energy: 'Term') -> tuple[list[float], list[float], list[float]]:
+        """Return the head, the literals and the steps for the compiled motion."""
         needed = [self._needed(x.place) for x in (self.slope(energy), energy)]
-        provided = range(self.constants, self.constants + _GIVEN)
-        moving = set(provided)
-        literals, fixed = list[int](), list[int]()
-        runs: list[list[int]] = [[], []]
-        for i in sorted(needed[0] | needed[1]):
-            operation, a, b = self.steps[i]
-            if isinstance(a, float):
-                literals.append(i)
-            elif operation != _LEAF and not moving.isdisjoint((a, b)):
-                moving.add(i)
-                for run, own in zip(runs, needed, strict=True):
-                    run.extend([i] if i in own else ())
-            elif operation != _LEAF:
-                fixed.append(i)
+        every = [i for i in sorted(needed[0] | needed[1]) if self.steps[i][0] != _LEAF]
+        literals = [i for i in sorted(needed[0] | needed[1]) if self.ranks[i] == 0]
         known = [*range(self.constants), *literals]
-        rows: list[float] = []
-        for before, run in (
-                (known, fixed), *(([*known, *fixed, *provided], x) for x in runs)):
-            places = {x: i for i, x in enumerate([*before, *run])}
-            if len(places) > _MOST:
-                raise BadInputError(f'energy takes {len(places)} steps: expected {_MOST}')
+        fixed = [i for i in every if self.ranks[i] == 1]
+        provided = range(self.constants, self.constants + _GIVEN)
+        places = {x: i for i, x in enumerate([*known, *fixed])}
+        head, steps = [float(len(known))], list[float]()
+        for before, run in ((known, fixed), *(
+                (provided, [i for i in every if i in own and self.ranks[i] == 2])
+                for own in needed)):
+            places |= {x: i for i, x in enumerate([*before, *run])}
+            if len(before) + len(run) > _MOST:
+                raise BadInputError(
+                    f'energy takes {len(before) + len(run)} steps: expected {_MOST}')
+            head.append(float(len(run)))
             for i in run:
                 operation, a, b = self.steps[i]
-                rows += [float(operation), float(places[a]), float(places[b])]
-        return tuple(map(float, (
-            len(known), len(fixed), *map(len, runs), *values,
-            *(self.steps[i][1] for i in literals), *rows)))
+                if operation in (_SUM, _PRODUCT) and self.ranks[a] < self.ranks[i] == 2:
+                    operation, a, b = operation + 1, b, a
+                steps.append(float((operation * _PART + places[b]) * _PART + places[a]))
+        return head, [self.steps[i][1] for i in literals], steps
 
     def _needed(self, place: int) -> set[int]:
         found, open_ = set[int](), [place]
@@ -131,24 +145,47 @@ class Term:
     place: int
 
     @property
-    def _known(self) -> float | None:
-        operation, value, _ = self.program.steps[self.place]
-        return value if operation == _LEAF and isinstance(value, float) else None
+    def known(self) -> float | None:
+        """Return its value if it is a literal."""
+        value = self.program.steps[self.place][1]
+        return value if self.rank == 0 else None
+
+    @property
+    def rank(self) -> int:
+        """Return 0 for a literal, 1 for what depends on constants alone, 2 for what moves."""
+        return self.program.ranks[self.place]
+
+    def _with(self, operation: int, other: 'Term', neutral: float) -> 'Term':
+        if neutral in (self.known, other.known):
+            return other if self.known == neutral else self
+        a, b = sorted((self, other), key=lambda x: (x.rank, x.place))
+        return self.program.term(operation, a.place, b.place)
+
+    def factors(self) -> tuple[float, 'Term', 'Term']:
+        """Return the literal, the constant and the moving factor."""
+        one = self.program.literal(1.0)
+        if self.known is not None:
+            return self.known, one, one
+        operation, a, b = self.program.steps[self.place]
+        if operation == _PRODUCT and (first := Term(self.program, a)).rank < self.rank:
+            number, fixed, _ = first.factors()
+            rest = Term(self.program, b)
+            return (number, fixed, rest) if self.rank == 2 else (number, rest, one)
+        return (1.0, one, self) if self.rank == 2 else (1.0, self, one)
 
     def __add__(self, other: Number) -> 'Term':
         """Add."""
-        other = self.program.literal(other)
-        if self._known == 0.0 or other._known == 0.0:
-            return other if self._known == 0.0 else self
-        return self.program.term(_SUM, *sorted((self.place, other.place)))
+        return self._with(_SUM, self.program.literal(other), 0.0)
 
     def __mul__(self, other: Number) -> 'Term':
-        """Multiply."""
-        other = self.program.literal(other)
-        for one, two in ((self, other), (other, self)):
-            if one._known in (0.0, 1.0):
-                return one if one._known == 0.0 else two
-        return self.program.term(_PRODUCT, *sorted((self.place, other.place)))
+        """Multiply, literals and constants first."""
+        (number, *mine), (by, *its) = self.factors(), self.program.literal(other).factors()
+        found = self.program.literal(number * by)
+        if number * by == 0.0:
+            return found
+        for x, y in zip(mine, its, strict=True):
+            found = found._with(_PRODUCT, x._with(_PRODUCT, y, 1.0), 1.0)
+        return found
 
     __radd__, __rmul__ = __add__, __mul__
 
@@ -178,13 +215,12 @@ class Term:
             return self.program.literal(1.0)
         if not isinstance(exponent, Term) and exponent == int(exponent) and (
                 abs(exponent) <= _SMALL):
-            found = self if exponent > 0 else self.program.term(_INVERSE, self.place)
+            found = self if exponent > 0 else self._inverse()
             return math.prod([found] * (abs(int(exponent)) - 1), start=found)
-        return self.program.term(_POWER, self.place, self.program.literal(exponent).place)
+        return exp(exponent * log(self))
 
-    def positive(self) -> 'Term':
-        """Return this number, NaN unless it is positive."""
-        return self.program.term(_POSITIVE, self.place)
+    def _inverse(self) -> 'Term':
+        return self.program.inverses.get(self) or self.program.term(_INVERSE, self.place)
 
 
 @dataclass(frozen=True)
@@ -198,11 +234,14 @@ class Strain:
 
     def over_stretches(self, part: Callable[[Term], Term]) -> Term:
         """Return the sum of a function over the three principal stretches."""
-        return part(self.along) + 2.0 * part(self.across)
+        # An exponential along the field is a power of that across it, but not the reverse.
+        return 2.0 * part(self.across) + part(self.along)
 
 
 def log(x: Term) -> Term:
     """Return the natural logarithm; there is no energy where x is not positive."""
+    if x == x.program.across:
+        return -0.5 * log(x.program.along)
     return x.program.term(_LOG, x.place)
 
 
@@ -212,8 +251,15 @@ def log1p(x: Term) -> Term:
 
 
 def exp(x: Term) -> Term:
-    """Return the exponential."""
-    return x.program.term(_EXP, x.place)
+    """Return the exponential, as a power of one of the same term if there is one."""
+    if x.known is not None:
+        return x.program.literal(math.exp(x.known))
+    number, fixed, moving = x.factors()
+    by, first = x.program.exponentials.setdefault(
+        fixed * moving, (number, x.program.term(_EXP, x.place)))
+    times = number / by
+    return first ** times if times == int(times) and abs(times) <= _SMALL else (
+        x.program.term(_EXP, x.place))
 
 
 def expm1(x: Term) -> Term:
@@ -245,9 +291,17 @@ def law_of(
 
     """
     program = _Program(len(constants))
-    known, (along, across, first, second, _, _) = (
+    known, (along, across, _, first, second, _, _) = (
         program.leaves[:len(constants)], program.leaves[len(constants):])
     total = energy(Strain(first, second, along, across), *known)
+
+    @cache
+    def compiled() -> tuple[list[float], list[float], list[float]]:
+        return program.compiled(total)
+
+    def packed(numbers: tuple[float, ...]) -> tuple[float, ...]:
+        head, literals, steps = compiled()
+        return (*head, *numbers, *literals, *steps)
 
     def scaled(values: Mapping[str, Any]) -> tuple[float, Elastic]:
         import numpy as np  # which not all users of laws need
@@ -258,11 +312,11 @@ def law_of(
         for constant, value in zip(constants, numbers, strict=True):
             above(name, constant.name, value, constant.above)
         stiffness = elastic_stiffness(1.0, np.array([
-            FORMULA, 0.0, 1.0, 0.0, 0.0, math.inf, *program.packed(total, numbers)]))
+            FORMULA, 0.0, 1.0, 0.0, 0.0, math.inf, *packed(numbers)]))
         # psi'' is 3 at rest, in units of G.
         modulus = positive_modulus(name, stiffness / 3.0, 'of its energy at rest', numbers)
         scales = (modulus if x.unit == 'Pa' else 1.0 for x in constants)
-        return modulus, Elastic(name, FORMULA, program.packed(total, tuple(
+        return modulus, Elastic(name, FORMULA, packed(tuple(
             x / y for x, y in zip(numbers, scales, strict=True))), given(law, values, modulus))
 
     law = Law(name, text, source, tuple(

@@ -120,67 +120,82 @@ template <class R> struct Ogden {
 
 template <class R> struct Formula {
     // An energy that is written in Python, as programs for itself and its force: steps of an
-    // operation and two registers (hmsa/model/laws/formula.py).
-    enum Operation { sum = 1, product, inverted, defined, logarithm, of_1_more, exponential, less_1, powered };
-    static constexpr int most = 96;
-    int known, fixed;  // numbers, and registers of these alone
-    const double *force_steps, *energy_steps, *end;
+    // operation and two registers (hmsa/model/laws/formula.py), as one number.
+    enum Operation {
+        sum = 1, sum_fixed, product, product_fixed, inverted, defined, logarithm, of_1_more,
+        exponential, less_1
+    };
+    struct Step {
+        uint8_t operation, a, b;
+    };
+    static constexpr int most = 96, part = 128;
+    int known;  // numbers that are no results
+    int force_at, energy_at, end;
+    Step steps[3 * most];
     R constant[most];
     void read(const double *from)
     {
-        known = int(from[0]), fixed = known + int(from[1]);
+        known = int(from[0]);
+        force_at = int(from[1]);
+        energy_at = force_at + int(from[2]);
+        end = energy_at + int(from[3]);
+        from += 4;
         for (int i = 0; i < known; i++)
-            set(constant[i], 0, from[4 + i]);
-        const double *steps = from + 4 + known;
-        force_steps = steps + 3 * int(from[1]);
-        energy_steps = force_steps + 3 * int(from[2]);
-        end = energy_steps + 3 * int(from[3]);
-        run(steps, force_steps, constant, known);
+            set(constant[i], 0, *from++);
+        for (int i = 0; i < end; i++) {
+            const unsigned code = unsigned(*from++);
+            steps[i] = {uint8_t(code / (part * part)), uint8_t(code % part), uint8_t(code / part % part)};
+        }
+        run(0, force_at, constant, known);
     }
     void seed(int number, int j)
     {
         incline(constant[number], j, 1);
-        run(force_steps - 3 * (fixed - known), force_steps, constant, known);
+        run(0, force_at, constant, known);
+    }
+    // A constant for results of type S.
+    template <class S> HMSA_INLINE decltype(auto) fixed(int i) const
+    {
+        if constexpr (std::is_same_v<S, R>)
+            return (constant[i]);
+        else
+            return get(constant[i], 0);
     }
     // Puts the results of steps into registers from a place on; returns the last.
-    template <class S> static S run(const double *step, const double *end, S *x, int place)
+    template <class S> S run(int first, int last, S *x, int place) const
     {
-        for (; step < end; step += 3, place++) {
-            const S &a = x[int(step[1])], &b = x[int(step[2])];
+        S *to = x + place;
+        for (const Step *step = steps + first; step < steps + last; step++, to++) {
+            const S &a = x[step->a], &b = x[step->b];
             const real<S> &at = value(a);
-            switch (int(step[0])) {
-            case sum: x[place] = a + b; break;
-            case product: x[place] = a * b; break;
-            case inverted: x[place] = inverse(a); break;
-            case defined: x[place] = positive(a); break;
-            case logarithm: x[place] = through(a, real<S>(log(at)), real<S>(1.0 / at)); break;
-            case of_1_more: x[place] = through(a, real<S>(log1p(at)), real<S>(1.0 / (1.0 + at))); break;
-            case exponential: x[place] = through(a, real<S>(exp(at)), real<S>(exp(at))); break;
-            case less_1: x[place] = through(a, real<S>(expm1(at)), real<S>(exp(at))); break;
-            default: x[place] = power(a, b);
+            switch (step->operation) {
+            case sum: *to = a + b; break;
+            case sum_fixed: *to = a + fixed<S>(step->b); break;
+            case product: *to = a * b; break;
+            case product_fixed: *to = a * fixed<S>(step->b); break;
+            case inverted: *to = inverse(a); break;
+            case defined: *to = value(b) > 0 ? a : S(a * __builtin_nan("")); break;
+            case logarithm: *to = through(a, log(at), 1.0 / at); break;
+            case of_1_more: *to = through(a, log1p(at), 1.0 / (1.0 + at)); break;
+            case exponential: *to = exp(a); break;
+            default: *to = through(a, expm1(at), exp(at));
             }
         }
-        return x[place - 1];
+        return to[-1];
     }
-    template <class S> S ran(const double *first, const double *last, const S &l) const
+    template <class S> S ran(int first, int last, const S &l) const
     {
-        S x[most];
-        for (int i = 0; i < fixed; i++) {
-            if constexpr (std::is_same_v<S, R>)
-                x[i] = constant[i];
-            else
-                x[i] = 0.0 * l + get(constant[i], 0);
-        }
         // Without cancellation near l = 1.
         const S e = l - 1.0, i_l = inverse(positive(l)), cubic = 2.0 * e * (l * l + l + 1.0) * i_l * i_l;
         const real<S> across = sqrt(value(i_l));
-        x[fixed] = l, x[fixed + 1] = through(l, across, real<S>(-0.5 * across * value(i_l)));
-        x[fixed + 2] = e * e * (l + 2.0) * i_l, x[fixed + 3] = e * e * (2.0 * l + 1.0) * i_l * i_l;
-        x[fixed + 4] = cubic, x[fixed + 5] = cubic * i_l;
-        return run(first, last, x, fixed + 6);
+        S x[most];
+        x[0] = l, x[1] = through(l, across, real<S>(-0.5 * across * value(i_l))), x[2] = i_l;
+        x[3] = e * e * (l + 2.0) * i_l, x[4] = e * e * (2.0 * l + 1.0) * i_l * i_l;
+        x[5] = cubic, x[6] = cubic * i_l;
+        return run(first, last, x, 7);
     }
-    template <class S> S force(const S &l) const { return ran(force_steps, energy_steps, l); }
-    double energy(double l) const { return ran(energy_steps, end, l); }
+    template <class S> S force(const S &l) const { return ran(force_at, energy_at, l); }
+    double energy(double l) const { return ran(energy_at, end, l); }
 };
 
 // sum c_k u^k, and its derivative by u.

@@ -113,6 +113,7 @@ inline double log(double x)
     n += extra;
     const double s = (m - 1) / (m + 1), z = s * s;  // 2 atanh(s), with |s| <= 0.172
     double sum = 1. / 23;
+#pragma GCC unroll 11  // divides while compiling
     for (int k = 21; k >= 1; k -= 2)
         sum = 1. / k + z * sum;
     return n * 0.693147180369123816490 + (2 * s * sum + n * 1.90821492927058770002e-10);
