@@ -151,6 +151,14 @@ def test_without_a_confirmed_move_no_sensor_counts_as_changed(seed, count):
     assert 'plans use it' in left[-1].words
 
 
+def test_a_sensor_that_jumps_in_a_move_is_named_and_costs_nothing():
+    # Its gain changes by 1.5 % in the fourth move, which would look like an error of 5 % of the
+    # sixth one.
+    left = bench_harm.run(drawn(62117, bench_harm.MOVES, changes=True), 'adapt')
+    assert left[3].warned
+    assert max(x.size for x in left) < 0.01
+
+
 def test_moves_that_get_worse_end_feedback_and_what_it_did_is_taken_back(monkeypatch):
     # What is believed and chosen is wrong, whatever samples say.
     for name, other in (

@@ -301,7 +301,7 @@ class AdaptiveJoint:
         trouble = screening.trouble if found is None else found.trouble
         jumped = found is not None and not trouble and found.jumped > _JUMPED
         if jumped:
-            trouble = 'samples fit better if the sensor has changed since the move before'
+            trouble = 'samples fit better if the sensor has changed'
         if screening.lost > before and not trust.acts:
             # Later samples of the same update have fitted again.
             trouble = trouble or screening.last_trouble
@@ -319,8 +319,8 @@ class AdaptiveJoint:
             if acted:
                 self._tried.clear()
             # Samples that an estimate in use has fitted do not show what has changed since.
-            self._restart(max(estimator.since, self._fitted) if acted and not jumped
-                          else estimator.since)
+            self._restart(found.jump if found is not None and jumped else max(
+                estimator.since, self._fitted if acted else 0))
         elif found is not None and trust.acts and trust.failed and (
                 self._look_at_sensor(found, now, anew=not acted)):
             found = None

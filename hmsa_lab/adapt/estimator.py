@@ -103,7 +103,8 @@ class StateEstimate:
     noise: float  # standard deviation of a sample
     trusted: bool  # whether it may be used for plans
     trouble: str  # reason if not; else empty
-    jumped: float  # log odds that the sensor has changed since the last move
+    jumped: float  # log odds that the sensor has changed since the last move began
+    jump: int  # time in ns from which it has
     changed: float  # relative log odds that the sensor is not as before; see `Solution`
     poor: bool  # whether the newest samples fit worse than their noise
 
@@ -414,7 +415,8 @@ class Estimator:
         return StateEstimate(
             time, float(state[-2]), float(state[-1]), values, self.prior.free, deviations,
             covariance, off, found.instead, doubt, window.suspects.gain, self.noise,
-            not trouble, trouble, found.jumped, found.changed, found.poor)
+            not trouble, trouble, found.jumped,
+            self._origin + round(found.jump * NANOSECONDS), found.changed, found.poor)
 
     def _strange(self, z: Array) -> str:
         """Return a message on implausible parameters that samples would need; else empty."""

@@ -190,19 +190,18 @@ class Evidence:
             square + (weight[:, None] * apart).T @ apart,
             likely @ (self._without_gain(found, counts) - found.step[best]))
 
-    def best(self, information: Array | None = None) -> float:
-        """
-        Return the log probability of the most probable set of suspects.
+    def best(self) -> float:
+        """Return the log probability of the most probable set of suspects."""
+        return float(np.max(self._all().evidence))
 
-        With the ``information`` of a prior that differs from the one before, by `others`, that of
-        its density counts, too.
-        """
-        found = self._all().evidence
-        if information is not None:
-            sought = np.pad(self.suspects.seeking, ((0, 0), (0, 2)), constant_values=True)
-            nothing = np.zeros(sought.shape)
-            found = found + 0.5 * _solution(information, nothing, nothing, sought)[1]
-        return float(np.max(found))
+    def with_more(self, across: Array, square: Array, gradient: Array) -> 'Evidence':
+        """Return it with n further coordinates that vary; second derivatives (q, n) and (n, n)."""
+        more = np.full(len(gradient), math.inf)
+        return Evidence(
+            self.suspects, np.append(self.z, 0.0 * gradient),
+            np.block([[self.matrix, across], [across.T, square]]),
+            np.append(self.gradient, gradient), np.append(self.low, -more),
+            np.append(self.high, more))
 
     def _without_gain(self, found: Explained, places: NDArray[np.int64]) -> Array:
         """Return the steps for sets of suspects, with other parameters in place of a gain."""

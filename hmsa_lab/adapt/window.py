@@ -31,8 +31,9 @@ _MORE = 1.3
 # Mean negative log probability of a sample above which a fit is poor, its usual value, and the
 # number of standard deviations by which it surely differs from that.
 _POOR, _USUAL, _SURELY = 1.0, 0.5, 5.0
-# Standard deviations of a jump of the sensor, and its prior improbability as a logarithm.
-_JUMPS, _RARELY = {'stretch_bias': 0.05, GAIN: 0.1}, 3.0
+# Standard deviations of a jump of bias and gain of the sensor, and its prior improbability as a
+# logarithm.
+_JUMPS, _RARELY = np.array([0.05, 0.1]), 3.0
 # Maximum change per step of a coordinate that is a logarithm.
 _STRIDE = 0.3
 
@@ -84,7 +85,8 @@ class Solution:
     # As `off` for plans, where other parameters represent an apparent gain of the sensor.
     instead: Array
     doubt: BiasCase
-    jumped: float = -math.inf  # log odds that the sensor jumped before the window
+    jumped: float = -math.inf  # log odds that the sensor jumped before or in the window
+    jump: float = 0.0  # when it did
     # Log odds that the sensor is not as before, if it may not be, relative to the possible ones
     # against that.
     changed: float = -math.inf
@@ -152,10 +154,16 @@ class Window:
     others: Others = Others(1.0, *(np.zeros(()),) * 3)  # effect of other sets
     rest: Rest | None = None  # equilibrium at the begin
     first: bool = True  # whether the prior contains no samples
-    jumped: float = -math.inf  # as in `Solution`, when the suspects were weighed
+    # As in `Solution`, when the suspects were weighed.
+    jumped: float = -math.inf
+    jump: float = 0.0
     changed: float = -math.inf
     before: SensorBefore | None = None  # of a sensor that may have changed
+    known: tuple[int, ...] = field(init=False)  # suspects estimated in earlier windows
     information: Array = field(init=False)  # inverse of the covariance, set by `settle`
+
+    def __post_init__(self) -> None:
+        self.known = self.suspected
 
     def values_at(self, z: Array) -> dict[str, Any]:
         """Return the values of all quantities for coordinates."""
@@ -247,14 +255,16 @@ class Window:
                     found = other
                 else:
                     self.suspected, self.others = before
-            self.jumped, self.changed = self._sensor_jumped(found), self._sensor_changed(found)
+            self.jumped, self.jump = self._sensor_jumped(found, noise)
+            self.changed = self._sensor_changed(found)
         sure, off, square, instead = self.others
         doubt = self._doubt(found)
+        poor = self._is_poor(found, noise, 0.5 * float(found.gradient @ doubt.off) + (
+            _SURELY * math.sqrt(0.5 * len(self.time))))
         return Solution(
             found.z, found.here, sure * inverse(found.matrix, found.loose) + square,
             np.broadcast_to(off, z.shape), np.broadcast_to(instead, z.shape), doubt, self.jumped,
-            self.changed, self._is_poor(found, noise, 0.5 * float(found.gradient @ doubt.off) + (
-                _SURELY * math.sqrt(0.5 * len(self.time)))))
+            self.jump, self.changed, poor)
 
     def _doubt(self, found: Optimum) -> BiasCase:
         """Return the expectation if a constant force and a gain may be in error, too."""
@@ -263,29 +273,41 @@ class Window:
         off = covariance @ found.gradient
         return BiasCase(off, covariance + np.outer(off, off))
 
-    def _sensor_jumped(self, found: Optimum) -> float:
+    def _sensor_jumped(self, found: Optimum, noise: float) -> tuple[float, float]:
         """
-        Return the log odds that bias and gain of the sensor jumped before the window.
+        Return the log odds that bias and gain of the sensor jumped, and when.
 
-        The rival is that all is as in earlier windows, or as their samples leave open.
+        They jumped before the window, or at one of its samples, all of which are as probable. The
+        rival is that all is as in earlier windows, or as their samples leave open.
         """
-        if self.first:
-            return -math.inf
-        places = np.flatnonzero(self.suspects.of(('stretch_bias', GAIN), len(found.z)))
-        covariance = self.covariance.copy()
-        covariance[places, places] += np.square([_JUMPS[self.free[i]] for i in places])
-        low, high = self._room(found.z)
-        odds = []
-        jumped: Array = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
-        for information in (self.information, jumped):
-            pull = information @ (self.mean - found.z)
-            change = information - self.information
-            odds.append(Evidence(
-                self.suspects, found.z, found.matrix + change,
-                found.gradient + change @ (self.mean - found.z), low, high).best(information)
-                - 0.5 * float((self.mean - found.z) @ pull))
-            low[places], high[places] = -math.inf, math.inf
-        return odds[1] - odds[0] - _RARELY
+        if self.first or not len(self.time):
+            return -math.inf, self.begin
+        here = found.here
+        shown = self.stretch - here.residual - coordinate_of(here.values['law']).rest
+        jump = np.column_stack([np.ones(len(shown)), shown])
+        weighted = here.weights[:, None] * jump / noise ** 2
+        # Derivatives of the cost by a jump at each sample.
+        across, square, pull = (np.cumsum(x[::-1], axis=0)[::-1] for x in (
+            here.by[:, :, None] * weighted[:, None], jump[:, :, None] * weighted[:, None],
+            here.residual[:, None] * weighted))
+        square = square + np.diag(_JUMPS ** -2)
+        # The time is the most probable one with the suspects of earlier windows.
+        inner = inverse(found.matrix, self.suspects.sought(len(found.z), self.known))
+        step = self.suspects.at_ease(found.z, self.known) - found.z
+        step = step + inner @ (found.gradient - found.matrix @ step)
+        left = pull - np.einsum('kqj,q->kj', across, step)
+        matrix = square - np.einsum('kqi,qr,krj->kij', across, inner, across)
+        gain = 0.5 * (np.einsum('ki,kij,kj->k', left, np.linalg.inv(matrix), left)
+                      - np.linalg.slogdet(matrix)[1])
+        best = int(np.argmax(gain))
+        rival = Evidence(
+            self.suspects, found.z, found.matrix, found.gradient, *self._room(found.z))
+        jumped, place = max(
+            (rival.with_more(across[k, :, :n], square[k, :n, :n], pull[k, :n]).best()
+             - float(np.sum(np.log(_JUMPS[:n]))) + share, k)
+            for k, share in ((0, 0.0), (best, math.log(np.mean(np.exp(gain - gain[best])))))
+            for n in (1, 2))
+        return jumped - rival.best() - _RARELY, float(self.time[place]) if place else self.begin
 
     def _sensor_changed(self, found: Optimum) -> float:
         """
