@@ -618,9 +618,8 @@ Array times_of(const Problem &problem)
     return found;
 }
 
-// Largest peak-to-peak value of a sum of waves within a period.
-double swing_of(const std::vector<Wave> &waves, const Array &times, double period,
-                double *contrast = nullptr)
+// Peak to peak of a sum of waves: the peak and the trough of two modes may be periods apart.
+double swing_of(const std::vector<Wave> &waves, const Array &times, double *contrast = nullptr)
 {
     Array sum(times.size(), 0.0);
     const double step = times.size() > 1 ? times[1] : 1.0;
@@ -635,22 +634,13 @@ double swing_of(const std::vector<Wave> &waves, const Array &times, double perio
             real = next;
         }
     }
-    const double found = largest(times.data(), sum.data(), int(times.size()), 0.0, period);
+    const auto [low, high] = std::minmax_element(sum.begin(), sum.end());
     if (contrast) {
         // Times of the two values.
-        const int ahead = std::max(int(period / step), 1);
-        double most = -1.0;
-        for (size_t i = 0; i < times.size(); ++i) {
-            for (size_t j = i + 1; j < times.size() && j <= i + ahead; ++j) {
-                if (std::fabs(sum[i] - sum[j]) > most) {
-                    most = std::fabs(sum[i] - sum[j]);
-                    contrast[0] = times[i];
-                    contrast[1] = times[j];
-                }
-            }
-        }
+        contrast[0] = times[size_t(low - sum.begin())];
+        contrast[1] = times[size_t(high - sum.begin())];
     }
-    return found;
+    return *high - *low;
 }
 
 // Peak to peak of a wave in its first period.
@@ -751,7 +741,7 @@ Found bounds(const Problem &problem, const std::vector<Base> &bases, const Array
         times = times_of(problem);
         double contrast[2] = {0.0, 0.0};
         found.waves = waves_of(problem, bases[best.base], best.wave());
-        swing_of(found.waves, times, problem.period, contrast);
+        swing_of(found.waves, times, contrast);
         deviation_of_all = deviation_of_sum(
             problem, creep_of[best.base], found.waves, contrast);
     }
@@ -768,7 +758,7 @@ Found bounds(const Problem &problem, const std::vector<Base> &bases, const Array
         if (problem.modes.empty()) {
             swing = swing_of(x->wave());
         } else {
-            swing = swing_of(waves_of(problem, bases[x->base], x->wave()), times, problem.period);
+            swing = swing_of(waves_of(problem, bases[x->base], x->wave()), times);
             deviation = deviation_of_all;
         }
         const double shift = std::sqrt(x->offset_variance);
@@ -1075,7 +1065,7 @@ Found fit(const Array &time, const Array &values, const Settings &settings)
         const auto [low, high] = std::minmax_element(values.begin(), values.end());
         const double error = settings.z * found.noise;
         vibration.high = std::min(
-            vibration.high, seen / std::cos(0.5 * between) + std::sqrt(2.0) * error);
+            vibration.high, (*high - *low) / std::cos(0.5 * between) + std::sqrt(2.0) * error);
         vibration.low = std::max(
             vibration.low, std::min(seen, vibration.value) - peaks * found.noise);
         offset.high = std::min(offset.high, std::max(*high + error, offset.value));

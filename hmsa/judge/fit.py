@@ -41,7 +41,7 @@ class VibrationFit:
     """Result of a fit of samples."""
 
     offset: BoundedValue
-    vibration: BoundedValue  #: largest peak to peak in a period after time 0, of all modes
+    vibration: BoundedValue  #: largest peak to peak after time 0, of all modes
     modes: tuple[tuple[float, float], ...]  #: frequency in rad/s and peak to peak, largest first
     noise: float  #: standard deviation of a sample
     usual: float  #: robust standard deviation, insensitive to single events
