@@ -171,6 +171,14 @@ def test_the_peak_and_the_trough_of_two_modes_may_be_periods_apart(seed):
     assert verdict_of(draw(seed, 'both')) != 'arrived'
 
 
+def test_modes_that_noise_hides_together_are_not_taken_for_rest():
+    modes = (1.0, 0.98, 0.022), (1.0, 3.19, 0.022), (1.4, 5.77, 0.022)
+    assert np.ptp(ringing(*modes, noise=0.0, seconds=0.07)[1]) > 0.02 * STEP
+    verdicts = {str(judge(*ringing(*modes, noise=0.8, seconds=0.07, seed=x), setpoint(
+        end=70 * MS)).verdict) for x in range(60)}
+    assert 'arrived' not in verdicts
+
+
 def test_less_noise_or_more_samples_never_make_a_second_mode_undecided():
     random = np.random.default_rng(5)
     for seed in range(12):

@@ -46,9 +46,9 @@ constexpr double creep_first = 1.5;
 constexpr double modes_from = 0.5, modes_to = 8.0, fewest_cycles = 3.0;
 constexpr double mode_decays[] = {0.0, 0.1, 0.3};
 constexpr double mode_damped = 0.12;
-// Decay, relative to the frequency of the model, of what may be hidden in noise: alone, and beside
-// a vibration that shows. What decays faster is gone after a few samples: so many, in energy.
-constexpr double hidden_alone = 0.3, hidden_beside = 0.05, few_samples = 10.0;
+// Decay, relative to the frequency of the model, of what may be hidden in noise. What decays
+// faster is gone after a few samples: so many, in energy.
+constexpr double hidden_decay = 0.3, few_samples = 10.0;
 // A further mode reduces the squares by this many variances of the residual, and by those of a
 // search in noise.
 constexpr double certain = 14.0;
@@ -1052,12 +1052,10 @@ Found fit(const Array &time, const Array &values, const Settings &settings)
     }
     Bounded &vibration = found.vibration, &offset = found.offset;
     const double gone = 0.5 / (few_samples * problem.interval * settings.frequency);
+    // Two modes may hide, in noise that is not the same.
     vibration.high = std::max(
-        vibration.high, rest.hidden(settings, std::min(hidden_alone, gone)));
-    if (vibration.low > 0.0) {
-        vibration.high = std::max(
-            vibration.high, vibration.value + rest.hidden(settings, hidden_beside));
-    }
+        vibration.high, (vibration.low > 0.0 ? vibration.value : 0.0) + std::sqrt(2.0)
+            * rest.hidden(settings, std::min(hidden_decay, gone)));
     // What samples show themselves, whatever rings: frequencies may change with the amplitude.
     const double between = problem.interval * found.resolved,
                  seen = largest(time.data(), values.data(), base.count(), 0.0, problem.period);

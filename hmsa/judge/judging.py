@@ -379,7 +379,7 @@ def _open(
             within = max(within, (most - value) / apart)
     # Bounds shrink with the noise, and with the square root of the number of samples.
     less = _ADVISED * max(beyond if math.isfinite(beyond) else within, 1.0)
-    mend = (f'{less**2:.2g} times as many samples a second, or {less:.2g} times less noise, would '
+    mend = (f'{less**2:.3g} times as many samples a second, or {less:.3g} times less noise, would '
             'decide it')
     if independent < INDEPENDENT:
         mend = ('the fit residuals are not noise, so neither more samples nor less noise would '
