@@ -64,6 +64,8 @@ class SkipWithoutRos:
 
 def pytest_configure(config: pytest.Config) -> None:
     """Ignore warnings that cannot be fixed here, and start processes alike."""
+    # As `hmsa` does, before NumPy is imported.
+    os.environ.setdefault('OMP_NUM_THREADS', '1')
     # What a command prints must not depend on how busy the machine is.
     terminal.PATIENCE = 1e6
     if not has('rclpy'):
