@@ -57,6 +57,7 @@ template <class S> struct Modal {
     int count = 0;
     S ratio[most_modes], share[most_modes], damping[most_modes], exponent[most_modes],
         share_exponent[most_modes];
+    bool grows[most_modes];  // whether the frequency ratio changes with the stretch
     bool graded = false;  // whether shares change with the stretch
     template <class System, class Bare> HMSA_INLINE void change(const System &system, const Bare &bare,
         const S &a, const S &net, const S *x, const S *at, S *by) const
@@ -67,14 +68,18 @@ template <class S> struct Modal {
         const S light = system.acceleration(
             l, S{zero}, S{zero}, [&](const S &) { return S{zero + 1.0}; });
         const double here = get(value(l), 0), stiff = get(value(a), 0);
-        S square = (system.force(l + aside) - system.force(l - aside)) * (0.5 / aside) * light * a;
-        square = square + (zero + abs(stiff * bare.elastic(here).d[0] / bare.mass(here)) - value(square));
-        const real<S> root = sqrt(value(square));
+        const real<S> squared = zero + abs(stiff * bare.elastic(here).d[0] / bare.mass(here)), root = sqrt(squared);
+        S square;
+        if constexpr (count_of<S> > 0) {
+            square = (system.force(l + aside) - system.force(l - aside)) * (0.5 / aside) * light * a;
+            square.v = squared;
+        } else
+            square = squared;
         const S frequency = square * (0.5 / root) + 0.5 * root;
         const S pull = net * light;
         for (int k = 0; k < count; k++, at += 2, by += 2) {
             // The position of a beam may be 0, and its exponent is.
-            const S grown = here > 0 ? power(l, exponent[k]) * ratio[k] : ratio[k];
+            const S grown = grows[k] && here > 0 ? power(l, exponent[k]) * ratio[k] : ratio[k];
             by[0] = at[1];
             by[1] = grown * grown * (pull + square * (l - at[0])) - frequency * grown * damping[k] * 2.0 * at[1];
         }
@@ -183,8 +188,10 @@ template <class C, class System, int NB = most_branches> struct Response {
                 modes.ratio[k] = seeded_at(at), modes.share[k] = seeded_at(at + 1);
                 modes.damping[k] = seeded_at(at + 2), modes.exponent[k] = seeded_at(at + 3);
                 modes.share_exponent[k] = seeded_at(at + 4);
-                modes.graded |= of.theta[at + 4] != 0;
-                each([&](int, int wanted) { modes.graded |= wanted == at + 4; });
+                modes.grows[k] = of.theta[at + 3] != 0, modes.graded |= of.theta[at + 4] != 0;
+                each([&](int, int wanted) {
+                    modes.grows[k] |= wanted == at + 3, modes.graded |= wanted == at + 4;
+                });
             }
         }
     }
