@@ -55,7 +55,9 @@ _DEGREE, _EXACT, _ROUNDING, _LEAST = 9, 1e-13, 1e-15, 0.01
 _HALVINGS = 20
 # Half width of the piece about rest, unless a smaller one is needed.
 _BESIDE = 0.0625
-_NEWTON = 100
+# Steps of Newton's method, and a relative step of the size of rounding, which ends it: steps below
+# may never end.
+_NEWTON, _ROUNDED = 100, 1e-15
 _NODES: Array = -np.cos(np.pi * (np.arange(_DEGREE + 1) + 0.5) / (_DEGREE + 1))
 _TO_SERIES: Array = np.linalg.inv(
     chebyshev.chebvander(_NODES, _DEGREE)).astype(np.float64)
@@ -183,9 +185,9 @@ class _Block:
             low, high = np.where(off < 0.0, s, low), np.where(off > 0.0, s, high)
             nearer = s * np.exp(-off / (1.0 + grows / 3.0))
             nearer = np.where((low <= nearer) & (nearer <= high), nearer, 0.5 * (low + high))
-            if np.all(np.abs(nearer - s) <= 2e-16 * s):
+            step, s = nearer - s, nearer
+            if np.all(np.abs(step) <= _ROUNDED * s):
                 break
-            s = nearer
         return s
 
     def states(self, stretches: Array) -> Array:
