@@ -194,6 +194,15 @@ def test_send_fails_where_the_actuator_is_measured_to_miss_the_setpoint(start, r
     assert found, send.stderr
     # As simulated with the true block.
     assert list(map(float, found.groups())) == pytest.approx([0.0393, 89.9, 0.0366], rel=0.1)
+    # A plan that ends at the setpoint already stays: what it missed before is another matter.
+    send = start.hmsa('send', '1.4:0.5', '--wait', '--timeout', '200')
+    assert send.wait(300.0) == 1, send.output
+    assert 'setpoint 2 of 2: rests ' in send.stderr
+    send = start.hmsa('send', '1.4:0.5', '1.001:2', '1.0:2', '--wait', '--timeout', '200')
+    assert send.wait(300.0) == 1, send.output
+    send = start.hmsa('send', '1.0:0.5', '--wait', '--timeout', '200')
+    assert send.wait(300.0) == 0, send.output
+    assert 'the plan is unchanged\ndone: at_rest, measured' in send.stdout
 
 
 @pytest.mark.slow

@@ -1,6 +1,7 @@
 """Conversion of messages to records and back, without loss."""
 
 from contextlib import suppress
+from dataclasses import replace
 import math
 
 from builtin_interfaces.msg import Duration, Time
@@ -264,3 +265,17 @@ def test_only_what_arrived_or_nobody_measures_is_no_failure(
         assert (values['vibration'], values['vibration_percent']) == ('0.002', '1')
         assert read.basis == 'measured'
         assert read.figures == ARRIVED.to_dict()
+
+
+@pytest.mark.parametrize(('newest', 'failure'), [
+    (replace(ARRIVED, setpoint=replace(SETPOINT, number=3)), ''),
+    (missed(replace(SETPOINT, number=3), 'left out'), 'setpoint 3 of 3: missed')])
+def test_an_unchanged_plan_is_judged_by_its_last_setpoint(newest, failure):
+    progress, worst = Progress('at_rest', 3, 3, '1.4'), missed(SETPOINT, 'left out')
+    read = StatusVerdict.read(sent(conversions.to_planner_status(records.StatusChanged(
+        records.Verdict(records.Severity.WARN, worst.verdict, 'a sentence', 'x'), progress,
+        {'a': progress, 'b': progress}, 1, 0, 0, {'a': newest, 'b': worst}, worst,
+        measuring=True))))
+    assert 'setpoint 2 of 3' in read.failure
+    assert read.of_last(['a']).failure == failure
+    assert read.of_last(['b']).failure == 'setpoint 2 of 3: missed'

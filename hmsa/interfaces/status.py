@@ -1,6 +1,6 @@
 """Contents of diagnostics, in particular the planner's verdict."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 import json
@@ -57,7 +57,8 @@ class StatusVerdict:
     ``figures`` its values. ``measuring`` indicates recent samples, and ``late`` is the number of
     late commands since the planner started. ``unheard`` is the reason why commands are not carried
     out. ``plan`` is the number of plans until then, and ``answers`` contains the verdicts on
-    recent requests by name.
+    recent requests by name. ``newest`` contains the code of the newest finding and its setpoint by
+    joint, whose name is empty if there is only one.
     """
 
     level: int
@@ -76,6 +77,17 @@ class StatusVerdict:
     figures: Mapping[str, object] = field(default_factory=dict)
     plan: int = 0
     answers: Mapping[str, object] = field(default_factory=dict)
+    newest: Mapping[str, tuple[str, int]] = field(default_factory=dict)
+
+    def of_last(self, joints: Sequence[str]) -> 'StatusVerdict':
+        """Return the verdict with the finding of the last setpoint of joints, not the worst."""
+        if self.figures.get('setpoint') == self.setpoints:
+            return self
+        found = [x for name, x in self.newest.items() if not name or name in joints]
+        code, number = next((x for x in found if x[0] != Code.ARRIVED), (*found, ('', 0))[0])
+        return replace(
+            self, measured=code, finding=f'setpoint {number} of {self.setpoints}: {code}',
+            figures={})
 
     def on(self, request: str) -> 'StatusVerdict | None':
         """Return the verdict on a recent request by its name, None if it is not known."""
@@ -121,4 +133,6 @@ class StatusVerdict:
             values.get('worst_message', ''), values.get('unheard', ''),
             values.get('measuring') == 'True', whole(values.get('late')),
             _object(values.get('finding', '')), whole(values.get('plan')),
-            _object(values.get('answers', '')))
+            _object(values.get('answers', '')),
+            {x.removesuffix('measured').rstrip('.'): (y, whole(values.get(f'{x}_setpoint')))
+             for x, y in values.items() if x == 'measured' or x.endswith('.measured')})

@@ -364,6 +364,9 @@ class PlannerClient(Link):
             # A refused request leaves the sequence alone, and is the last one in the status.
             end = end.on(verdict.request) or replace(
                 end, level=verdict.level, message=verdict.message, code=verdict.code)
+        if verdict.code == Code.UNCHANGED:
+            # The plan is that of an earlier request, and its other setpoints are not this one's.
+            end = end.of_last(self._joints)
         late = end.late - verdict.late
         if late > 0 and not end.failure and end.measured != Code.ARRIVED:
             raise HmsaError(
