@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmsa.identification.fit import loss, weights_of
-from hmsa.identification.quantities import complete, quantity_of, values_at
+from hmsa.identification.quantities import complete, quantity_of, TEMPERATURE, values_at
 from hmsa.identification.response import sensed
 from hmsa.model.equations import Array
 from hmsa.model.laws.coordinate import coordinate_of
@@ -299,6 +299,9 @@ class Window:
         matrix = square - np.einsum('kqi,qr,krj->kij', across, inner, across)
         gain = 0.5 * (np.einsum('ki,kij,kj->k', left, np.linalg.inv(matrix), left)
                       - np.linalg.slogdet(matrix)[1])
+        if TEMPERATURE in self.free:
+            # A block that warms or cools moves within the window, too.
+            gain = gain[:1]
         best = int(np.argmax(gain))
         rival = Evidence(
             self.suspects, found.z, found.matrix, found.gradient, *self._room(found.z))
