@@ -43,8 +43,8 @@ from hmsa_lab.bench.calibration import calibrate_coil, decay, loop
 from hmsa_lab.bench.iron_core import fit_core
 from hmsa_lab.bench.simulated_board import REST_LENGTH, SimulatedBoard, TESLA_PER_AMPERE
 from hmsa_lab.experiments.tuning import chosen, excitation, identified, Tuning
-from hmsa_ros.device.driven import HardwareDevice, HardwareJoint
 from hmsa_ros.device.watchdog import Fallback
+from hmsa_ros.device.worker import HardwareDevice, HardwareJoint
 from hmsa_ros.runtime.loop import Loop
 from hmsa_ros.runtime.records import Output, Settings, StatusChanged, Trajectory
 

@@ -8,8 +8,8 @@ import pytest
 from hmsa.errors import BadInputError
 from hmsa_lab.bench import Assembly, CoilModel, parts, SensorScale
 from hmsa_lab.bench import assembly as assembly_module
-from hmsa_ros.device.driven import HardwareDevice, HardwareJoint
 from hmsa_ros.device.watchdog import Fallback, Kind
+from hmsa_ros.device.worker import HardwareDevice, HardwareJoint
 
 MS = 1_000_000
 START = 1000 * MS

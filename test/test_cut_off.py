@@ -5,9 +5,9 @@ import pytest
 from hmsa.errors import BadInputError
 from hmsa.model.actuators import Setup
 from hmsa.model.parameters import paper_actuator
-from hmsa_ros.device.driven import HardwareDevice, HardwareJoint
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.device.watchdog import Fallback, Kind
+from hmsa_ros.device.worker import HardwareDevice, HardwareJoint
 
 MS = 1_000_000
 START = 1000 * MS

@@ -10,12 +10,10 @@ import pytest
 
 from hmsa.errors import BadInputError, HmsaError
 from hmsa_ros.device import StateLostError
-from hmsa_ros.device.clock_map import ClockMap
-from hmsa_ros.device.driven import HardwareDevice, HardwareJoint
-from hmsa_ros.device.hardware import Calls, load
+from hmsa_ros.device.hardware import Calls, ClockMap, load
 from hmsa_ros.device.interlock import judge_hardware
 from hmsa_ros.device.watchdog import Fallback, Kind
-from hmsa_ros.device.worker import HardwareWorker
+from hmsa_ros.device.worker import HardwareDevice, HardwareJoint, HardwareWorker
 
 MS = 1_000_000
 START = 1000 * MS

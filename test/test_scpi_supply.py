@@ -7,8 +7,8 @@ from extras import needs
 import pytest
 
 from hmsa_lab.bench.scpi_supply import ScpiSupply, SimulatedSupply, Supply, SupplyError
-from hmsa_ros.device.driven import HardwareDevice, HardwareJoint
 from hmsa_ros.device.watchdog import Fallback, Kind
+from hmsa_ros.device.worker import HardwareDevice, HardwareJoint
 
 START = 10**18
 

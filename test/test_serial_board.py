@@ -23,8 +23,8 @@ from hmsa.interfaces import topics
 from hmsa_lab.bench import _board, serial_board
 from hmsa_lab.bench.serial_board import Board, BoardError, framed, SerialBoard
 from hmsa_lab.bench.simulated_board import REST_LENGTH, SimulatedBoard, TESLA_PER_AMPERE
-from hmsa_ros.device.driven import HardwareDevice, HardwareJoint
 from hmsa_ros.device.watchdog import Fallback, Kind
+from hmsa_ros.device.worker import HardwareDevice, HardwareJoint
 
 FIRMWARE = Path(_board.__file__).with_name('hmsa_board')
 SETTINGS = {'coil.tesla_per_ampere': TESLA_PER_AMPERE, 'sensor.rest_length': REST_LENGTH}

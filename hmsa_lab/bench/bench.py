@@ -14,10 +14,9 @@ from hmsa.model.equations import Array
 from hmsa.model.sensor import Sample
 from hmsa.model.units import NANOSECONDS
 from hmsa_ros.device.coil import Coil, HardwareJoint
-from hmsa_ros.device.driven import HardwareDevice
 from hmsa_ros.device.hardware import Calls, load
 from hmsa_ros.device.watchdog import Change, Fallback
-from hmsa_ros.device.worker import HardwareWorker
+from hmsa_ros.device.worker import HardwareDevice, HardwareWorker
 
 # In s: lead time of levels, interval of heartbeats, silence after which the coil is cut off, limit
 # for the start, and sleeping time of a waiting loop.

@@ -17,10 +17,9 @@ from hmsa.interfaces import topics
 from hmsa.interfaces.parameters import ParameterSpec, PUBLISH_RATE
 from hmsa.model.units import NANOSECONDS
 from hmsa_ros.device.coil import HardwareJoint
-from hmsa_ros.device.driven import HardwareDevice
 from hmsa_ros.device.hardware import Calls, load, OPTIONAL
 from hmsa_ros.device.interlock import Interlock, judge_hardware, judge_interlock
-from hmsa_ros.device.worker import HardwareWorker
+from hmsa_ros.device.worker import HardwareDevice, HardwareWorker
 from hmsa_ros.nodes import conversions, ros_entities
 from hmsa_ros.nodes.capture import decode
 from hmsa_ros.nodes.device_node import COMMON, DeviceJoint, DeviceNode, FALLBACK, fallback_from
