@@ -19,7 +19,7 @@ from benchmarks.beam_rod import FIRST, Rod
 from benchmarks.bench_continuum import advised
 from benchmarks.sheet import Sheet
 from hmsa import Actuator
-from hmsa.api.doubts import unquestioned
+from hmsa.api.facts import unquestioned
 from hmsa.identification.measurement import Measurement
 from hmsa.model.equations import elastic_force
 from hmsa.model.laws.bending import deflection

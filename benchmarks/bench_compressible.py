@@ -16,7 +16,7 @@ import numpy as np
 from benchmarks.block_elements import Block
 from benchmarks.sheet import Sheet
 from hmsa import Actuator
-from hmsa.api.doubts import unquestioned
+from hmsa.api.facts import unquestioned
 from hmsa.model.equations import Array, elastic_force
 from hmsa.model.law import natural_frequency
 

@@ -19,7 +19,7 @@ import numpy as np
 from benchmarks.block_elements import Block
 from benchmarks.sheet import Sheet
 from hmsa import Actuator
-from hmsa.api.doubts import unquestioned
+from hmsa.api.facts import unquestioned
 from hmsa.identification.identify import identify
 from hmsa.identification.measurement import Measurement
 from hmsa.identification.quantities import (

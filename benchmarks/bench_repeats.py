@@ -18,7 +18,7 @@ from benchmarks.bench_continuum import SHAPES
 from benchmarks.block_elements import Block
 from benchmarks.sheet import Sheet
 from hmsa import Actuator
-from hmsa.api.doubts import unquestioned
+from hmsa.api.facts import unquestioned
 from hmsa.identification.learning import learn, SequenceRepeat, TargetWindow
 from hmsa.model.equations import Array, natural_frequency
 from hmsa.model.laws.elastica import FIRST_SHARE

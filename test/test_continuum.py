@@ -10,7 +10,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from hmsa import Actuator
-from hmsa.api.doubts import unquestioned
+from hmsa.api.facts import unquestioned
 from hmsa.cli import main
 from hmsa.errors import BadInputError
 from hmsa.model import law

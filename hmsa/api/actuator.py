@@ -24,8 +24,7 @@ from hmsa.api.arguments import (
     suggesting,
     whole,
 )
-from hmsa.api.doubts import unquestioned, warn
-from hmsa.api.mounting import facts, further_facts, with_mount
+from hmsa.api.facts import facts, further_facts, unquestioned, warn, with_mount
 from hmsa.errors import assume, BadInputError, check_choice, UnusualWarning
 from hmsa.files import write_text, yaml_text
 from hmsa.interfaces.actuator import actuator_from, model_from, parameters_of

@@ -118,8 +118,8 @@ def run(arguments: argparse.Namespace) -> int:
     for quantity in wanted:
         if not _known(quantity.key, given):
             given[quantity.key] = default_of(quantity, given)
-    from hmsa.api.doubts import doubts as doubts_of
-    from hmsa.api.mounting import facts, further_facts
+    from hmsa.api.facts import doubts as doubts_of
+    from hmsa.api.facts import facts, further_facts
 
     made = _actuator(form, given, arguments.law, arguments.mount)
     found = made.scales
@@ -210,7 +210,7 @@ def _actuator(
         form: str, given: Mapping[str, float], law: str | None, mount: str) -> 'Actuator':
     """Return the actuator with its coil."""
     from hmsa.api.actuator import Actuator
-    from hmsa.api.doubts import unquestioned
+    from hmsa.api.facts import unquestioned
 
     # Only the one that is given.
     damping = (DAMPING.key,) if DAMPING.key in given else _DAMPED
