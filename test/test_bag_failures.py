@@ -17,9 +17,8 @@ import pytest
 from hmsa.bag import metadata
 from hmsa.bag.output import OutputFile
 from hmsa.bag.reader import BagReader
-from hmsa.bag.reception import judge, WARN
 from hmsa.bag.writer import BagTopic, BagWriter, recover
-from hmsa.bag.writer_thread import lost_by_topic, RecordingLimits, WriterThread
+from hmsa.bag.writer_thread import judge, lost_by_topic, RecordingLimits, WARN, WriterThread
 from hmsa.errors import BadInputError, BagError
 
 TOPIC = BagTopic('/a', 'std_msgs/msg/UInt8', 'uint8 data\n')

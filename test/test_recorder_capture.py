@@ -7,7 +7,7 @@ from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 from std_msgs.msg import Float64
 
-from hmsa.bag.reception import RecordedTopic
+from hmsa.bag.writer_thread import RecordedTopic
 from hmsa_ros.nodes import subscribing
 from hmsa_ros.nodes.capture import Capture, RawSubscription, SimulatedTime
 from hmsa_ros.nodes.selection import Selection

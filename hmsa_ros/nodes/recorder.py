@@ -24,9 +24,16 @@ from rosgraph_msgs.msg import Clock
 
 from hmsa import __version__
 from hmsa.bag.output import PRESETS
-from hmsa.bag.reception import figures, judge, RecordedTopic
 from hmsa.bag.writer import BagWriter, parse_custom_data
-from hmsa.bag.writer_thread import lost_by_topic, RecordingLimits, Status, WriterThread
+from hmsa.bag.writer_thread import (
+    figures,
+    judge,
+    lost_by_topic,
+    RecordedTopic,
+    RecordingLimits,
+    Status,
+    WriterThread,
+)
 from hmsa.errors import BadInputError, BagError
 from hmsa.interfaces import topics
 from hmsa.interfaces.parameters import duration_from, duration_specs, ParameterSpec

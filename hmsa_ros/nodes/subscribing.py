@@ -8,9 +8,8 @@ from rclpy.qos import QoSProfile
 
 from hmsa.bag.definitions import message_definition, type_hash
 from hmsa.bag.qos import Qos
-from hmsa.bag.reception import RecordedTopic
 from hmsa.bag.writer import BagTopic
-from hmsa.bag.writer_thread import WriterThread
+from hmsa.bag.writer_thread import RecordedTopic, WriterThread
 from hmsa.errors import BagError
 from hmsa_ros.nodes.capture import Capture, RawSubscription
 from hmsa_ros.nodes.ros_entities import interface_class
