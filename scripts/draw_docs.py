@@ -54,8 +54,7 @@ from hmsa.report import looks, style  # noqa: E402
 from hmsa.report.arrivals import Part  # noqa: E402
 from hmsa.report.paper import SCREEN  # noqa: E402
 from hmsa.report.picture import draw  # noqa: E402
-from hmsa.runs.record import RecordedLevel, Run  # noqa: E402
-from hmsa.runs.setpoints import described  # noqa: E402
+from hmsa.runs.record import described, RecordedLevel, Run  # noqa: E402
 from hmsa_ros.clients.demo import second_act, SEQUENCE  # noqa: E402
 from hmsa_studies.paper import draw_figure, FIGURES  # noqa: E402
 

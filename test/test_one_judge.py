@@ -16,7 +16,7 @@ from hmsa.judge.records import SensorModel
 from hmsa.model.actuators import Setup
 from hmsa.model.parameters import paper_actuator
 from hmsa.model.sensor import SensorErrors
-from hmsa.report.outcome import findings_of
+from hmsa.report.evaluation import findings_of
 from hmsa.runs.record import LearntSensor, RecordedLevel, Run
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.runtime.records import EstimateChanged, Send, Settings, StatusChanged, Trajectory

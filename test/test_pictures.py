@@ -21,7 +21,7 @@ from hmsa.model.residual import percent
 from hmsa.report import style
 from hmsa.report.arrivals import Part
 from hmsa.report.charts import commanded, PANELS
-from hmsa.report.curves import decimate, through, TimeCurve
+from hmsa.report.figures import decimate, through, TimeCurve
 from hmsa.report.looks import case, CASES, LineStyle, SHAPERS
 from hmsa.report.paper import KINDS, named, Paper
 from hmsa.report.picture import draw, draw_bands

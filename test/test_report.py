@@ -36,14 +36,12 @@ from hmsa.model.units import NANOSECONDS
 from hmsa.planning.planner import Options, Planner
 from hmsa.report.arrivals import Part
 from hmsa.report.charts import MOST_PANELS
-from hmsa.report.curves import BUCKETS, decimate
-from hmsa.report.evaluation import evaluate, plan_points
-from hmsa.report.outcome import findings_of, level_results
+from hmsa.report.evaluation import evaluate, findings_of, level_results, plan_points
+from hmsa.report.figures import BUCKETS, decimate
 from hmsa.report.page import page
 from hmsa.report.picture import draw
 from hmsa.runs.bags import read_run, read_runs
-from hmsa.runs.record import in_force, RecordedLevel, without_repeats
-from hmsa.runs.setpoints import described
+from hmsa.runs.record import described, in_force, RecordedLevel, without_repeats
 from hmsa.runs.topics import (
     APPLIED,
     COMMAND,

@@ -14,8 +14,7 @@ from hmsa.interfaces.outcome import Outcome
 from hmsa.model.equations import Array
 from hmsa.model.simulation import longest_motion, response
 from hmsa.model.units import NANOSECONDS
-from hmsa.runs.record import read_only, RecordedLevel, Run
-from hmsa.runs.setpoints import described
+from hmsa.runs.record import described, read_only, RecordedLevel, Run
 from hmsa.runs.tables import levels_of, samples_of, UNITS, write_run
 from hmsa.table import dataset, frame, Table
 
@@ -113,7 +112,7 @@ class Motion:
             write_text(file_of(path), page([part]))
         if part.evaluation.findings:
             return setpoints([part])
-        from hmsa.report.outcome import level_results, level_table
+        from hmsa.report.evaluation import level_results, level_table
 
         return level_table(level_results(self.run))
 

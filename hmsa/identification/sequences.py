@@ -9,8 +9,7 @@ from hmsa.errors import BadInputError
 from hmsa.identification.learning import learn, Learnt, SequenceRepeat, TargetWindow
 from hmsa.interfaces.outcome import LEVELS
 from hmsa.model.units import NANOSECONDS
-from hmsa.runs.record import ROUNDED, Run
-from hmsa.runs.setpoints import setpoints_of
+from hmsa.runs.record import ROUNDED, Run, setpoints_of
 
 
 def learn_from(runs: Sequence[Run]) -> tuple[Learnt, list[TargetWindow]]:

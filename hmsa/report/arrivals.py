@@ -10,8 +10,8 @@ from hmsa.judge.records import Tolerances
 from hmsa.model.equations import Array
 from hmsa.model.residual import percent
 from hmsa.model.units import NANOSECONDS
-from hmsa.report.curves import TimeCurve
 from hmsa.report.evaluation import evaluate, Evaluation, MoveResult, verdicts
+from hmsa.report.figures import TimeCurve
 from hmsa.runs.record import lateness_of, RecordedLevel, Run, Times, without_repeats
 
 # A change of level that took effect within this time in s of its timestamp was on time: the clock

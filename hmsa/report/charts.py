@@ -16,8 +16,7 @@ from hmsa.model.equations import Array, elastic_force
 from hmsa.model.residual import RESOLVED
 from hmsa.report import looks, paper
 from hmsa.report.arrivals import around, left_text, Part, results_of, span, worst
-from hmsa.report.curves import decimate, TimeCurve
-from hmsa.report.figures import Axis, Curve, Panel
+from hmsa.report.figures import Axis, Curve, decimate, Panel, TimeCurve
 from hmsa.report.looks import BLACK, BLUE, LineStyle, VERMILION
 from hmsa.runs.record import held_at
 

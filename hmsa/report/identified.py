@@ -11,8 +11,7 @@ from hmsa.identification.result import Identification
 from hmsa.model.equations import Array
 from hmsa.report import looks
 from hmsa.report.charts import TimeUnit, unit_for
-from hmsa.report.curves import BUCKETS, decimate
-from hmsa.report.figures import Axis, Curve, Figure, Panel
+from hmsa.report.figures import Axis, BUCKETS, Curve, decimate, Figure, Panel
 from hmsa.report.looks import BLACK, BLUE, LineStyle, VERMILION
 from hmsa.report.page import document, FOLDER
 from hmsa.table import Column, Table

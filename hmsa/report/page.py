@@ -22,11 +22,11 @@ from hmsa.model.equations import critical_zeta, stretch_limits
 from hmsa.model.parameters import ActuatorParameters
 from hmsa.model.residual import percent
 from hmsa.model.units import NANOSECONDS
-from hmsa.report import charts, curves, looks
+from hmsa.report import charts, looks
 from hmsa.report.arrivals import NOT_MOVED, Part, residual_text, title, worst
 from hmsa.report.charts import TimeUnit
 from hmsa.report.evaluation import FEW_SAMPLES, plan_points, verdict_on
-from hmsa.report.figures import Figure
+from hmsa.report.figures import BUCKETS, Figure
 from hmsa.runs.record import Run
 from hmsa.runs.topics import APPLIED
 from hmsa.table import Column, Table
@@ -83,7 +83,7 @@ def page(parts: Sequence[Part]) -> str:
         recorded=_table({'run': '', 'parameter': '', 'value': ''}, [
             (part.run.label, key, json.dumps(value)) for part in parts
             for key, value in part.run.parameters.items()]),
-        buckets=curves.BUCKETS)
+        buckets=BUCKETS)
 
 
 def document(

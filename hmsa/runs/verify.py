@@ -25,7 +25,7 @@ from hmsa.interfaces.topics import PLANT
 from hmsa.model.creep import Creep
 from hmsa.model.equations import Array
 from hmsa.model.units import NANOSECONDS
-from hmsa.runs.bags import read_runs
+from hmsa.runs.bags import CLOCK_JUMP, read_runs
 from hmsa.runs.parameters import creep_of, of_joint
 from hmsa.runs.record import (
     in_force,
@@ -35,7 +35,6 @@ from hmsa.runs.record import (
     Run,
     without_repeats,
 )
-from hmsa.runs.samples import CLOCK_JUMP
 from hmsa.runs.topics import APPLIED, COMMAND, FORCE, JOINT_STATES
 
 if TYPE_CHECKING:

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
     from hmsa.judge.records import Finding, Tolerances
     from hmsa.report.arrivals import Part
-    from hmsa.report.outcome import LevelResult
+    from hmsa.report.evaluation import LevelResult
     from hmsa_ros.clients.experiment import Conducted, Experiment
 
 NOT_MEASURED = 'predicted, not measured'
@@ -100,7 +100,7 @@ def run(arguments: argparse.Namespace) -> int:
             so_far = f'; the bag so far: {experiment.bag}' if experiment.bag.exists() else ''
             print(f'interrupted{so_far}', file=sys.stderr)
             return ENDING.status
-        from hmsa.report.outcome import level_results
+        from hmsa.report.evaluation import level_results
 
         levels = [y for x in parts for y in level_results(x.run)] if experiment.levels else []
         findings = [y for x in parts for y in x.evaluation.findings] if (
@@ -156,7 +156,7 @@ def _show(update: 'Callable[[str, float | None], None]', what: str, share: float
     """Show the current activity; import modules of the evaluation during the sequence."""
     update(what, share)
     if share > 0.0:
-        import_module('hmsa.report.outcome')
+        import_module('hmsa.report.evaluation')
         import_module('hmsa.report.comparison')
 
 
@@ -225,7 +225,7 @@ def _print(
         experiment: 'Experiment', parts: 'list[Part]', levels: 'list[LevelResult]', reason: str,
         done: 'Conducted', report: Path | None) -> None:
     from hmsa.report.comparison import setpoints
-    from hmsa.report.outcome import level_table
+    from hmsa.report.evaluation import level_table
 
     if levels:
         print(level_table(levels))

@@ -24,8 +24,7 @@ from hmsa.model.parameters import ActuatorParameters, paper_actuator
 from hmsa.model.sensor import SensorErrors
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Options, Planner
-from hmsa.report.evaluation import MoveResult
-from hmsa.report.outcome import findings_of
+from hmsa.report.evaluation import findings_of, MoveResult
 from hmsa.runs.bags import read_runs
 from hmsa.runs.record import without_repeats
 from hmsa_ros.clients.experiment import conduct, Experiment
