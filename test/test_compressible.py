@@ -17,9 +17,8 @@ from hmsa.cli import main
 from hmsa.errors import BadInputError
 from hmsa.identification.files import Belief, file_text
 from hmsa.identification.identify import identify
-from hmsa.identification.known import Known
 from hmsa.identification.measurement import Measurement
-from hmsa.identification.quantities import actuator_of, DEFAULT_FREE, values_of
+from hmsa.identification.quantities import actuator_of, DEFAULT_FREE, Known, values_of
 from hmsa.identification.response import difference, respond
 from hmsa.model import equations
 from hmsa.model.actuators import Actuators, Setup

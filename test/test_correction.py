@@ -10,7 +10,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from hmsa.identification.known import Known
+from hmsa.identification.quantities import Known
 from hmsa.model.sensor import Sample
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Options as PlannerOptions

@@ -11,9 +11,8 @@ import yaml
 from hmsa.cli import main
 from hmsa.errors import BadInputError
 from hmsa.identification.identify import identify
-from hmsa.identification.known import Known
 from hmsa.identification.measurement import Measurement
-from hmsa.identification.quantities import check_free
+from hmsa.identification.quantities import check_free, Known
 from hmsa.interfaces.actuator import actuator_from, parameters_of
 
 NOISE = 1e-3

@@ -12,11 +12,11 @@ from hmsa.cli import main
 from hmsa.identification.excitation import Bounds, excite
 from hmsa.identification.files import file_text, read_belief
 from hmsa.identification.identify import identify
-from hmsa.identification.known import Known
 from hmsa.identification.measurement import Measurement
 from hmsa.identification.quantities import (
     DEFAULT_FREE,
     from_coordinate,
+    Known,
     MODES,
     SECONDARY,
     to_coordinate,

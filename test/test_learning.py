@@ -11,8 +11,7 @@ import pytest
 from hmsa import Actuator
 from hmsa.cli import main
 from hmsa.errors import BadInputError
-from hmsa.identification.learning import learn, SequenceRepeat, TargetWindow
-from hmsa.identification.sequences import levels_in
+from hmsa.identification.learning import learn, levels_in, SequenceRepeat, TargetWindow
 from hmsa.model.modes import Modes
 from hmsa.model.parameters import paper_actuator
 from hmsa.model.simulation import simulate

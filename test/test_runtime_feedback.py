@@ -11,7 +11,7 @@ from test_runtime_watch import Loop, MS, START
 
 from hmsa.errors import BadInputError
 from hmsa.identification.files import read_belief
-from hmsa.identification.known import Known
+from hmsa.identification.quantities import Known
 from hmsa.model.creep import Creep
 from hmsa.model.parameters import paper_actuator
 from hmsa.planning.planner import Options

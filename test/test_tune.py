@@ -15,8 +15,8 @@ from hmsa.cli import main
 from hmsa.errors import BadInputError
 from hmsa.identification.files import read_belief
 from hmsa.identification.identify import identify
-from hmsa.identification.known import Known
 from hmsa.identification.measurement import Measurement
+from hmsa.identification.quantities import Known
 from hmsa.model.parameters import paper_actuator
 from hmsa.runs.bags import read_run
 from hmsa.runs.parameters import read_parameter_file

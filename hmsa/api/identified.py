@@ -17,9 +17,8 @@ from hmsa.errors import BadInputError, excerpt
 from hmsa.files import may_be_bag, write_text
 from hmsa.identification.files import Belief, belief_in, file_text
 from hmsa.identification.identify import identify as find
-from hmsa.identification.known import Known
 from hmsa.identification.measurement import Measurement, recording_of
-from hmsa.identification.quantities import free_of
+from hmsa.identification.quantities import free_of, Known
 from hmsa.identification.result import Identification
 from hmsa.identification.tables import read_csv
 from hmsa.model.thermal import checked_temperature

@@ -220,7 +220,7 @@ def sequence_of(
     if arguments.levels is None:
         return [], []
     if arguments.levels.suffix.lower() in ('.yaml', '.yml'):
-        from hmsa.identification.sequences import levels_in
+        from hmsa.identification.learning import levels_in
 
         rows = levels_in(arguments.levels)
     else:

@@ -17,8 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hmsa.identification.fit import Fit
-from hmsa.identification.noise import inflation, Whiteness, whiteness
+from hmsa.identification.fit import Fit, inflation, Whiteness, whiteness
 from hmsa.identification.quantities import BRANCHES, quantity_of
 from hmsa.identification.response import respond
 from hmsa.identification.result import Defect

@@ -19,7 +19,7 @@ import yaml
 from hmsa.errors import BadInputError
 from hmsa.files import yaml_text
 from hmsa.identification import quantities
-from hmsa.identification.known import Known, PREFIX
+from hmsa.identification.quantities import Known, PREFIX
 from hmsa.identification.result import Identification
 from hmsa.interfaces.actuator import actuator_from, parameters_of, thermal_from
 from hmsa.interfaces.parameters import BLOCK, number_of

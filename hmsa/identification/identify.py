@@ -10,22 +10,30 @@ import numpy as np
 from hmsa.errors import BadInputError, check_number
 from hmsa.identification import diagnosis, quantities
 from hmsa.identification.defects import dead_band, GAIN
-from hmsa.identification.fit import Fit, fit, loss, robust_scale
+from hmsa.identification.diagnosis import repeated
+from hmsa.identification.fit import (
+    errors_of_stamps,
+    Fit,
+    fit,
+    HALF_95,
+    loss,
+    robust_scale,
+    whiteness,
+    widening,
+)
 from hmsa.identification.initial_guess import begins_at_rest, segments
 from hmsa.identification.intervals import estimates_of, Precision, precision_of, stamp_error
-from hmsa.identification.lines import lines_of
 from hmsa.identification.measurement import Measurement
 from hmsa.identification.modal import (
     ENOUGH,
     explained,
+    lines_of,
     modes_in,
     rescaled,
     stiffens,
     with_modes,
     without_modes,
 )
-from hmsa.identification.noise import errors_of_stamps, HALF_95, whiteness, widening
-from hmsa.identification.repeats import repeated
 from hmsa.identification.result import Defect, Identification, IdentificationVerdict, Mode
 from hmsa.identification.search import rivals, search, unmoved
 from hmsa.interfaces.actuator import along_elastica, parameters_of

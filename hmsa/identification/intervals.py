@@ -9,9 +9,17 @@ import numpy as np
 from hmsa.errors import BadInputError
 from hmsa.identification import diagnosis, quantities
 from hmsa.identification.defects import Departures, departures
-from hmsa.identification.fit import Fit, fit, LEAST_SCALE, moved
+from hmsa.identification.fit import (
+    clustered,
+    Fit,
+    fit,
+    LEAST_SCALE,
+    moved,
+    Whiteness,
+    whiteness,
+    widening,
+)
 from hmsa.identification.initial_guess import changes_of
-from hmsa.identification.noise import clustered, Whiteness, whiteness, widening
 from hmsa.identification.response import respond
 from hmsa.identification.result import Estimate, Identification
 from hmsa.model.equations import Array

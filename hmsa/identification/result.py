@@ -5,9 +5,8 @@ from dataclasses import asdict, dataclass, replace
 import math
 from typing import Any, Literal
 
-from hmsa.identification.fit import Fit
+from hmsa.identification.fit import Fit, Whiteness
 from hmsa.identification.measurement import Measurement
-from hmsa.identification.noise import Whiteness
 from hmsa.identification.quantities import actuator_of, modulus_of
 from hmsa.model.equations import Array
 from hmsa.model.parameters import ActuatorParameters

@@ -7,8 +7,7 @@ from functools import partial
 import math
 
 from hmsa.errors import HmsaError
-from hmsa.identification.known import Known
-from hmsa.identification.quantities import TEMPERATURE
+from hmsa.identification.quantities import Known, TEMPERATURE
 from hmsa.judge.records import SensorModel
 from hmsa.judge.setpoint_samples import SetpointSamples
 from hmsa.model.equations import equilibrium_stretch

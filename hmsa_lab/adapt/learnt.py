@@ -11,10 +11,10 @@ import numpy as np
 from hmsa.errors import BadInputError
 from hmsa.files import write_text, yaml_text
 from hmsa.identification.files import known_lines
-from hmsa.identification.known import Known
 from hmsa.identification.quantities import (
     BRANCHES,
     derivative,
+    Known,
     quantity_of,
     TEMPERATURE,
     values_of,

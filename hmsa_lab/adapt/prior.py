@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hmsa.errors import BadInputError, check_number
-from hmsa.identification.known import Known
 from hmsa.identification.quantities import (
     check_free,
     complete,
     coordinates,
     derivative,
+    Known,
     QUANTITIES,
     TEMPERATURE,
     values_of,

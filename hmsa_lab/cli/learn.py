@@ -33,7 +33,7 @@ def add_parser(subparsers: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Read, learn and print."""
     check_targets(arguments.out)
-    from hmsa.identification.sequences import learn_from, sequence_text
+    from hmsa.identification.learning import learn_from, sequence_text
     from hmsa.runs.bags import read_run
     from hmsa.table import Column, Table
 

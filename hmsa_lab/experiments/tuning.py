@@ -21,9 +21,8 @@ from hmsa.files import write_text, yaml_text
 from hmsa.identification.excitation import Bounds, excite
 from hmsa.identification.files import Belief, belief_in, file_text, read_belief
 from hmsa.identification.identify import identify
-from hmsa.identification.known import Known, PREFIX
 from hmsa.identification.measurement import Measurement, recording_of
-from hmsa.identification.quantities import free_of
+from hmsa.identification.quantities import free_of, Known, PREFIX
 from hmsa.identification.result import Identification
 from hmsa.interfaces.parameters import ACTUATOR_FIELDS
 from hmsa.interfaces.topics import PLANNER

@@ -8,8 +8,7 @@ from typing import Any
 
 from hmsa.errors import BadInputError
 from hmsa.identification.files import errors_from
-from hmsa.identification.known import Known
-from hmsa.identification.quantities import check_free
+from hmsa.identification.quantities import check_free, Known
 from hmsa.interfaces import parameters as shared
 from hmsa.interfaces.actuator import planned_from
 from hmsa.interfaces.parameters import ParameterSpec

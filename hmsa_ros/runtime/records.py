@@ -15,7 +15,7 @@ from hmsa_ros.runtime.worker import Inline, Worker
 from hmsa_ros.timekeeping import steady_ns
 
 if TYPE_CHECKING:
-    from hmsa.identification.known import Known
+    from hmsa.identification.quantities import Known
 
 #: How velocities in a trajectory are treated: refused, as it rests at each point, or as a path.
 TRAJECTORY_MODES = ('rest', 'path')
