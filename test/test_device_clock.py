@@ -8,8 +8,7 @@ import pytest
 from test_runtime_hosts import BEATING, Bench
 from test_runtime_planner import HOLD, LEAD, MS, START, trajectory
 
-from hmsa_ros.runtime.device_clock import DeviceClock
-from hmsa_ros.runtime.receipts import Receipts
+from hmsa_ros.runtime.receipts import DeviceClock, Receipts
 from hmsa_ros.runtime.records import Severity, Stop, StretchRequest
 
 SECOND = 1000 * MS

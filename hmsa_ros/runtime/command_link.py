@@ -7,8 +7,7 @@ from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.planner import Planner
 from hmsa_ros.runtime.deviations import Deviations
-from hmsa_ros.runtime.device_clock import Offset
-from hmsa_ros.runtime.receipts import Receipts
+from hmsa_ros.runtime.receipts import Offset, Receipts
 from hmsa_ros.runtime.records import Environment, Output, Send, Settings, Severity, Verdict
 from hmsa_ros.runtime.takeover import Takeover
 
