@@ -15,9 +15,8 @@ from hmsa.errors import BadInputError
 from hmsa.identification.identify import identify
 from hmsa.identification.measurement import Measurement
 from hmsa.interfaces.actuator import creep_from
-from hmsa.model.creep import Creep
+from hmsa.model.creep import Creep, FLOWS
 from hmsa.model.delivery import Delivery, IDEAL
-from hmsa.model.flows import FLOWS
 from hmsa.model.moves import Level, Setpoint, State
 from hmsa.model.parameters import NondimensionalParameters, paper_actuator
 from hmsa.model.simulation import ActuatorSimulation, follow, sampled, with_followed

@@ -11,8 +11,8 @@ import pytest
 
 from hmsa.model.parameters import paper_actuator
 from hmsa.model.simulation import ActuatorSimulation
+from hmsa.planning.lateness import better_than_keeping
 from hmsa.planning.planner import Options, Planner
-from hmsa.planning.weighing import better_than_keeping
 from hmsa_ros.runtime.records import (
     Settings,
     Severity,

@@ -24,7 +24,7 @@ from hmsa.identification.result import Identification
 from hmsa.interfaces.actuator import actuator_from, parameters_of, thermal_from
 from hmsa.interfaces.parameters import BLOCK, number_of
 from hmsa.interfaces.topics import PLANNER, PLANT
-from hmsa.model.flows import CONSTANTS, Flow, FLOWS, MAXWELL
+from hmsa.model.creep import CONSTANTS, Flow, FLOWS, MAXWELL
 from hmsa.model.mismatch import Ellipsoid, Uncertainty
 from hmsa.model.parameters import ActuatorParameters
 from hmsa.planning.shapers.request import as_errors, LARGEST_ERROR

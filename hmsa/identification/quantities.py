@@ -14,9 +14,8 @@ import numpy as np
 
 from hmsa.errors import BadInputError, check_number, meant
 from hmsa.model.compressible import BULK_RATIOS, condensed
-from hmsa.model.creep import Creep
+from hmsa.model.creep import CONSTANTS, Creep, Flow, FLOWS, MAXWELL
 from hmsa.model.equations import Array
-from hmsa.model.flows import CONSTANTS, Flow, FLOWS, MAXWELL
 from hmsa.model.laws import LAWS
 from hmsa.model.laws.record import Constant, Elastic
 from hmsa.model.modes import Modes

@@ -14,8 +14,7 @@ from hmsa.interfaces.parameters import (
     THERMAL,
     VISCOELASTIC,
 )
-from hmsa.model.creep import Creep
-from hmsa.model.flows import FLOWS
+from hmsa.model.creep import Creep, FLOWS
 from hmsa.model.laws import LAWS
 from hmsa.model.laws.beam import ELASTIC_CURVE
 from hmsa.model.laws.record import BEAM

@@ -13,7 +13,7 @@ import re
 from typing import Any
 
 from hmsa.errors import BadInputError, check_choice, excerpt
-from hmsa.model.flows import CONSTANTS, FLOWS
+from hmsa.model.creep import CONSTANTS, FLOWS
 from hmsa.model.laws import LAWS
 from hmsa.model.thermal import COLDEST, HOTTEST, Thermal
 

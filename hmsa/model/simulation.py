@@ -16,10 +16,9 @@ from hmsa import motion
 from hmsa.errors import BadInputError, HmsaError
 from hmsa.model import law
 from hmsa.model.actuators import Actuators, RTOL, Setup
-from hmsa.model.creep import Creep
+from hmsa.model.creep import Creep, MAXWELL
 from hmsa.model.delivery import Delivery, IDEAL, Piece, ramps
 from hmsa.model.equations import Array
-from hmsa.model.flows import MAXWELL
 from hmsa.model.moves import Level, State
 from hmsa.model.parameters import ActuatorParameters, NondimensionalParameters
 from hmsa.model.schedule import CommandSchedule

@@ -10,9 +10,9 @@ import numpy as np
 
 from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import NANOSECONDS
+from hmsa.planning.lateness import LEAST_STEP, step_of
 from hmsa.planning.planner import Planner
 from hmsa.planning.timeline import Draft, JointModel, PlannedLevel, Timeline
-from hmsa.planning.weighing import LEAST_STEP, step_of
 from hmsa_lab.adapt.adaptive_joint import AdaptiveJoint
 from hmsa_lab.adapt.estimator import StateEstimate
 from hmsa_lab.adapt.expected_error import (

@@ -11,17 +11,17 @@ from hmsa.errors import HmsaError
 from hmsa.model.status import Code
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.group import PlannerGroup, resumed, Resumption
-from hmsa.planning.lateness import Lateness
-from hmsa.planning.planner import Planner
-from hmsa.planning.timeline import Draft, Options
-from hmsa.planning.weighing import (
+from hmsa.planning.lateness import (
     aims,
     better_than_keeping,
     compared,
     expected,
+    Lateness,
     SHARE,
     step_of,
 )
+from hmsa.planning.planner import Planner
+from hmsa.planning.timeline import Draft, Options
 from hmsa_ros.runtime.planning_task import PlanningTask, Replanning, replanning
 from hmsa_ros.runtime.receipts import Receipts
 from hmsa_ros.runtime.records import Settings, Severity, Verdict

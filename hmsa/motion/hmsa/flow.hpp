@@ -2,12 +2,12 @@
 // x = psi'(l) - w is the stress over its ratio. A rule contains this function over any scalar, and
 // the decay of x at constant stretch as a sum of exponentials. Dual provides derivatives,
 // including those by its constants, of type C. Constants are read from those of a branch
-// (hmsa/model/flows.py).
+// (hmsa/model/creep.py).
 #pragma once
 #include "dual.hpp"
 
 namespace hmsa {
-// Numbers as in hmsa/model/flows.py; and the maximum number of constants of a rule.
+// Numbers as in hmsa/model/creep.py; and the maximum number of constants of a rule.
 enum Flow { maxwell, power_law };
 constexpr int flow_constants = 2;
 
