@@ -514,7 +514,7 @@ class RosSide:
 
     def call(self, service_type: type[Any] | str, name: str, request: Any = None) -> Any:
         """Call a service once its nodes have discovered the client; return its response."""
-        from hmsa_ros.nodes.service_call import ServiceCall
+        from hmsa_ros.nodes.temporary_node import ServiceCall
         service_type, _ = bound(service_type)
         full = self.node.resolve_service_name(name)
         before = {x: x.count_clients(full) for x in Served.views()}
@@ -604,7 +604,7 @@ class Served:
             self._threads[-1].start()
 
     def _run(self, node: Any) -> None:
-        from hmsa_ros.nodes.runner import spin
+        from hmsa_ros.nodes.managed import spin
         try:
             spin((node,), lambda: self._ending)
         except BaseException as error:  # any error would have ended the process

@@ -521,7 +521,7 @@ def test_no_colour_where_none_is_wanted(code, env):
 def test_the_log_of_a_node_has_no_colour_where_none_is_wanted(ros_env):
     code = """
 import rclpy, sys
-from hmsa_ros.nodes.runner import run
+from hmsa_ros.nodes.managed import run
 class Node(rclpy.node.Node):
     def __init__(self):
         super().__init__('talker')

@@ -31,12 +31,12 @@ ONCE_IT_RUNS = """
 import os, signal, sys
 from pathlib import Path
 from hmsa_ros import entry
-from hmsa_ros.nodes import runner
-spin = runner.spin
+from hmsa_ros.nodes import managed
+spin = managed.spin
 def told_to_end(*arguments):
     os.kill(os.getpid(), signal.SIGTERM)
     spin(*arguments)
-runner.spin = told_to_end
+managed.spin = told_to_end
 sys.argv[1:] = []
 entry.{entry}()
 names = {{x.read_text().strip() for x in Path('/proc/self/task').glob('*/comm')}}
@@ -104,7 +104,7 @@ BUSY = """
 import sys
 from time import sleep
 from rclpy.node import Node
-from hmsa_ros.nodes.runner import run
+from hmsa_ros.nodes.managed import run
 class Busy(Node):
     def __init__(self):
         super().__init__('busy')

@@ -17,7 +17,7 @@ import sys
 from hmsa_ros.middleware import prepare_middleware
 prepare_middleware()
 from hmsa_ros.nodes.planner import PlannerNode
-from hmsa_ros.nodes.runner import run
+from hmsa_ros.nodes.managed import run
 
 class Shifted(PlannerNode):
     def now(self):

@@ -11,7 +11,7 @@ from hmsa.interfaces.parameters import ParameterSpec
 from hmsa_ros.nodes.capture import RawSubscription
 from hmsa_ros.nodes.managed import ManagedNode
 from hmsa_ros.nodes.parameters import declare
-from hmsa_ros.nodes.service_call import ServiceCall
+from hmsa_ros.nodes.temporary_node import ServiceCall
 
 pytestmark = pytest.mark.ros
 

@@ -147,7 +147,7 @@ def test_a_collection_of_garbage_does_not_look_at_all_libraries_again(ros_env):
     code = """
 import gc
 from rclpy.node import Node
-from hmsa_ros.nodes.runner import run
+from hmsa_ros.nodes.managed import run
 class Still(Node):
     @property
     def finished(self):

@@ -441,7 +441,7 @@ def test_the_process_of_a_node_warns_of_a_file_for_others(ros_env, tmp_path):
     file.write_text('/left/planner: {ros__parameters: {lead_time: 0.1}}\n', encoding='utf-8')
     code = (
         'from rclpy.node import Node\n'
-        'from hmsa_ros.nodes.runner import run\n'
+        'from hmsa_ros.nodes.managed import run\n'
         "Node.finished = True\nrun(lambda: Node('planner'))\n")
     for space, warnings in (('/', 1), ('/left', 0)):
         done = subprocess.run(

@@ -8,7 +8,7 @@ from rclpy.serialization import deserialize_message
 from std_msgs.msg import Float64
 
 from hmsa.bag.writer_thread import RecordedTopic
-from hmsa_ros.nodes import subscribing
+from hmsa_ros.nodes import recorder
 from hmsa_ros.nodes.capture import Capture, RawSubscription, SimulatedTime
 from hmsa_ros.nodes.selection import Selection
 
@@ -88,11 +88,11 @@ def test_messages_of_a_publisher_keep_their_order_when_one_had_to_be_sent_again(
 @pytest.mark.parametrize('largest', [
     (100,) * 50, (60_000,) * 6, (60_000,) * 200, (100, 3_000, 10**7)])
 def test_the_queues_of_all_topics_stay_within_their_share_of_the_memory(largest, monkeypatch):
-    monkeypatch.setattr(subscribing, 'RawSubscription', lambda *_: None)
+    monkeypatch.setattr(recorder, 'RawSubscription', lambda *_: None)
     replaced = []
     capture = Capture(lambda taken: None)
     monkeypatch.setattr(capture, 'replace', lambda topic, _: replaced.append(topic))
-    found = subscribing.Subscriptions(
+    found = recorder.Subscriptions(
         None, Selection(), None, capture, 10_000, 100 * 2**20)
     for i in range(len(largest)):
         qos = QoSProfile(depth=10_000)

@@ -10,7 +10,7 @@ from rclpy.parameter import Parameter
 from hmsa.bag.experiment import parameter_key
 from hmsa.errors import BadInputError
 from hmsa_ros.clients.remote import RemoteNode
-from hmsa_ros.nodes.service_call import RemoteParameters
+from hmsa_ros.nodes.temporary_node import RemoteParameters
 
 pytestmark = pytest.mark.ros
 

@@ -24,7 +24,7 @@ from sensor_msgs.msg import MagneticField
 
 from hmsa.interfaces import topics
 from hmsa_ros.nodes import ros_entities
-from hmsa_ros.nodes.runner import spin
+from hmsa_ros.nodes.managed import spin
 
 _TICK_SECONDS = 0.0005
 # The plant and an observing node.

@@ -22,7 +22,7 @@ from sensor_msgs.msg import JointState
 
 from hmsa.interfaces import topics
 from hmsa_ros.nodes import ros_entities
-from hmsa_ros.nodes.runner import spin
+from hmsa_ros.nodes.managed import spin
 
 #: Faults of the sensor.
 FAULTS = ('nan', 'freeze', 'jump', 'swap', 'twice', 'silence')

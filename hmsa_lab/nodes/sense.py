@@ -24,9 +24,8 @@ from hmsa_lab.bench.assembly import SensorScale
 from hmsa_lab.nodes import fields
 from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.conversions import from_time, to_status, to_time
-from hmsa_ros.nodes.managed import ManagedNode
+from hmsa_ros.nodes.managed import ManagedNode, run
 from hmsa_ros.nodes.parameters import declare
-from hmsa_ros.nodes.runner import run
 
 # Number of reference readings stored for interpolation.
 _KEPT = 1000

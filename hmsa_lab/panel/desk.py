@@ -33,7 +33,7 @@ from hmsa_ros.clients.experiment import Experiment, prepare, recorder_of
 from hmsa_ros.clients.link import Stopping
 from hmsa_ros.clients.processes import dated, Session
 from hmsa_ros.nodes import ros_entities
-from hmsa_ros.nodes.service_call import ServiceCall
+from hmsa_ros.nodes.temporary_node import ServiceCall
 from hmsa_ros.runtime.records import FEEDBACK_MODES as MODES
 
 # Interval of repeats in s, well within the default interlock_timeout of a driver.

@@ -28,8 +28,7 @@ from hmsa_ros.nodes.capture import decode, RawSubscription
 from hmsa_ros.nodes.conversions import from_time, to_trajectory
 from hmsa_ros.nodes.duplicate_nodes import DuplicateNodes, LATELY_SECONDS
 from hmsa_ros.nodes.ros_entities import publishers_of, recorders, subscribers_of
-from hmsa_ros.nodes.service_call import ServiceCall
-from hmsa_ros.nodes.temporary_node import SLICE_SECONDS
+from hmsa_ros.nodes.temporary_node import ServiceCall, SLICE_SECONDS
 
 # Time in s for an existing planner node to subscribe: configuration takes a fraction of a second,
 # much longer on a busy machine.

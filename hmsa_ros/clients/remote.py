@@ -17,8 +17,7 @@ from rclpy.parameter import get_parameter_value, parameter_value_to_python
 from rclpy.validate_topic_name import validate_topic_name
 
 from hmsa.errors import BadInputError
-from hmsa_ros.nodes.service_call import ServiceCall
-from hmsa_ros.nodes.temporary_node import TemporaryNode
+from hmsa_ros.nodes.temporary_node import ServiceCall, TemporaryNode
 
 
 def _ask(

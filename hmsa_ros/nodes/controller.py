@@ -23,9 +23,9 @@ from hmsa_ros.device.watchdog import Change
 from hmsa_ros.nodes import conversions, ros_entities
 from hmsa_ros.nodes.device_node import DeviceNode, TICK_SECONDS
 from hmsa_ros.nodes.driver import DriverNode, HARDWARE, SHORT
+from hmsa_ros.nodes.managed import run
 from hmsa_ros.nodes.planner import PlannerNode
 from hmsa_ros.nodes.plant import PlantNode
-from hmsa_ros.nodes.runner import run
 from hmsa_ros.runtime.records import Clock, ObservedSample, Output, Send, Severity
 from hmsa_ros.timekeeping import steady_ns
 

@@ -23,9 +23,8 @@ from hmsa_ros.device.worker import HardwareDevice, HardwareWorker
 from hmsa_ros.nodes import conversions, ros_entities
 from hmsa_ros.nodes.capture import decode
 from hmsa_ros.nodes.device_node import COMMON, DeviceJoint, DeviceNode, FALLBACK, fallback_from
-from hmsa_ros.nodes.managed import AUTOSTART
+from hmsa_ros.nodes.managed import AUTOSTART, run
 from hmsa_ros.nodes.parameters import declare_joints, JointParameters
-from hmsa_ros.nodes.runner import run
 
 # Time in s after which slow start-up of hardware is reported.
 _PATIENCE = 5.0

@@ -22,7 +22,7 @@ from hmsa.model.units import NANOSECONDS
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.nodes import conversions, ros_entities
 from hmsa_ros.nodes.device_node import COMMON, DeviceJoint, DeviceNode, FALLBACK, fallback_from
-from hmsa_ros.nodes.managed import AUTOSTART
+from hmsa_ros.nodes.managed import AUTOSTART, run
 from hmsa_ros.nodes.markers import (
     MARKER_FRAME,
     MARKER_RATE,
@@ -31,7 +31,6 @@ from hmsa_ros.nodes.markers import (
     show_states,
 )
 from hmsa_ros.nodes.parameters import declare_joints, JointParameters
-from hmsa_ros.nodes.runner import run
 from hmsa_ros.timekeeping import RealTimeFactor, StepWatch
 
 #: Parameters that may have a separate value for each joint.

@@ -19,7 +19,7 @@ from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.cdr import stamp_of
 from hmsa_ros.nodes.ros_entities import interface_class
 from hmsa_ros.nodes.selection import Filter, is_full_name, publisher_profile, Selection
-from hmsa_ros.nodes.service_call import ServiceCall
+from hmsa_ros.nodes.temporary_node import ServiceCall
 
 #: Limit on the number of publishers, each of which takes 1.5 ms and 35 kB.
 MOST_TOPICS = 1000

@@ -37,7 +37,7 @@ from hmsa.interfaces import topics
 from hmsa.interfaces.parameters import duration_from, duration_specs, ParameterSpec
 from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.conversions import to_clock, to_status
-from hmsa_ros.nodes.managed import ManagedNode
+from hmsa_ros.nodes.managed import ManagedNode, run
 from hmsa_ros.nodes.parameters import declare
 from hmsa_ros.nodes.playback_publishers import (
     create_senders,
@@ -47,7 +47,6 @@ from hmsa_ros.nodes.playback_publishers import (
     NAMED_AT_MOST,
     RequiredSubscribers,
 )
-from hmsa_ros.nodes.runner import run
 from hmsa_ros.nodes.selection import Filter
 
 _POLL_SECONDS = 0.02

@@ -22,7 +22,7 @@ from hmsa.bag.definitions import is_interface_package
 from hmsa.errors import BagError
 from hmsa.interfaces.topics import from_outside, Quality, Service, Topic
 from hmsa_ros.nodes.capture import RawSubscription
-from hmsa_ros.nodes.service_call import ServiceCall
+from hmsa_ros.nodes.temporary_node import ServiceCall
 
 # Name of a node that has not been discovered yet, or not any more.
 _UNKNOWN = '_NODE_NAME_UNKNOWN_'
