@@ -12,7 +12,7 @@ from benchmarks.defects import measured, motion, plants, Sensor, sequence
 from hmsa.cli import main
 from hmsa.errors import BadInputError
 from hmsa.identification.files import read_belief
-from hmsa.identification.tables import read_csv
+from hmsa.identification.measurement import read_csv
 
 TIMES = np.arange(500) * 1e-3
 LEVELS = steps((1.1, 1.4, 1.0), 0.0444, 3)

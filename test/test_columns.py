@@ -13,7 +13,7 @@ from hmsa.api.paths import read_path
 from hmsa.cli import main
 from hmsa.columns import read_table
 from hmsa.errors import AssumedWarning, BadInputError
-from hmsa.identification.tables import read_levels
+from hmsa.identification.measurement import read_levels
 from hmsa.model.laws.curve import points_in
 from hmsa_lab.bench.assembly import CoilModel
 

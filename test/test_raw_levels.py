@@ -12,7 +12,7 @@ import pytest
 
 from hmsa.cli import main
 from hmsa.identification.excitation import Bounds, excite
-from hmsa.identification.tables import read_levels
+from hmsa.identification.measurement import read_levels
 from hmsa.model.status import Code, RefusedError
 from hmsa.planning.planner import Options, Planner
 

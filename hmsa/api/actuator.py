@@ -783,7 +783,7 @@ class Actuator:
 
         """
         from hmsa.api.motion import simulated
-        from hmsa.identification.tables import read_levels
+        from hmsa.identification.measurement import read_levels
 
         if isinstance(levels, (str, Path)):
             times, values = read_levels(file_of(levels))

@@ -17,10 +17,9 @@ from hmsa.errors import BadInputError, excerpt
 from hmsa.files import may_be_bag, write_text
 from hmsa.identification.files import Belief, belief_in, file_text
 from hmsa.identification.identify import identify as find
-from hmsa.identification.measurement import Measurement, recording_of
+from hmsa.identification.measurement import Measurement, read_csv, recording_of
 from hmsa.identification.quantities import free_of, Known
 from hmsa.identification.result import Identification
-from hmsa.identification.tables import read_csv
 from hmsa.model.thermal import checked_temperature
 from hmsa.runs.bags import read_run
 from hmsa.table import Table

@@ -175,7 +175,7 @@ def _read(
             belief = belief.at_temperature(recording.temperature)
         return recording, replace(
             belief, actuator=actuator, others={**known, **belief.others}), True
-    from hmsa.identification.tables import read_csv
+    from hmsa.identification.measurement import read_csv
 
     slew = belief.number('slew_limit', 0.0) or math.inf
     return read_csv(

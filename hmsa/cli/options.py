@@ -224,7 +224,7 @@ def sequence_of(
 
         rows = levels_in(arguments.levels)
     else:
-        from hmsa.identification.tables import read_levels
+        from hmsa.identification.measurement import read_levels
 
         times, levels = read_levels(arguments.levels)
         rows = list(zip(times.tolist(), levels.tolist(), strict=True))
