@@ -28,7 +28,7 @@ from hmsa.planning.shapers.minimum_time import minimum_time
 from hmsa.planning.shapers.request import MoveRequest
 from hmsa.planning.shapers.two_step import two_step
 from hmsa.report import looks, style
-from hmsa.report.paper import Paper
+from hmsa.report.looks import Paper
 from hmsa_studies.residual import Actual, ringing
 
 # Smaller fractions of a step are rounding of the search on a grid.

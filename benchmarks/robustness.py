@@ -25,7 +25,7 @@ from hmsa.model.parameters import NondimensionalParameters
 from hmsa.model.residual import percent
 from hmsa.planning.shapers import SHAPERS
 from hmsa.planning.shapers.request import MoveRequest, SmoothLimits
-from hmsa.report.paper import SCREEN
+from hmsa.report.looks import SCREEN
 from hmsa_studies.pictures import draw_front, draw_robustness
 from hmsa_studies.residual import Actual, Errors
 from hmsa_studies.robustness import Candidate, candidates, Case, PARAMETERS, Result, study

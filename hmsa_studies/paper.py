@@ -12,7 +12,7 @@ import numpy as np
 
 from hmsa.model.equations import signed_root, stretch_limits
 from hmsa.report import looks, style
-from hmsa.report.paper import named, Paper
+from hmsa.report.looks import named, Paper
 from hmsa_studies import paper_data
 from hmsa_studies.paper_data import Data, PaperResponse, PaperSweep
 

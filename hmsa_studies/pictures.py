@@ -9,8 +9,7 @@ import numpy as np
 
 from hmsa.model.residual import percent
 from hmsa.report import looks, style
-from hmsa.report.looks import LineStyle
-from hmsa.report.paper import Paper
+from hmsa.report.looks import LineStyle, Paper
 from hmsa_studies.robustness import Candidate, Case, ORDERED, Result
 
 # Smaller residuals are drawn at this value.

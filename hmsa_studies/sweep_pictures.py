@@ -16,7 +16,7 @@ import numpy as np
 from hmsa.interfaces.parameters import PLANNED
 from hmsa.model.equations import Array
 from hmsa.report import looks, style
-from hmsa.report.paper import Paper
+from hmsa.report.looks import Paper
 from hmsa_studies.axes import SweepAxis, View
 from hmsa_studies.settings import ACTUAL, BLOCK_OF, Nondimensional
 

@@ -17,7 +17,7 @@ from benchmarks import claims
 from hmsa.cli import main
 from hmsa.model.parameters import NondimensionalParameters
 from hmsa.planning.two_step import plan_two_step
-from hmsa.report.paper import SCREEN
+from hmsa.report.looks import SCREEN
 from hmsa_studies import paper_data
 from hmsa_studies.paper import FIGURES, write_figure
 

@@ -22,8 +22,7 @@ from hmsa.report import style
 from hmsa.report.arrivals import Part
 from hmsa.report.charts import commanded, PANELS
 from hmsa.report.figures import decimate, through, TimeCurve
-from hmsa.report.looks import case, CASES, LineStyle, SHAPERS
-from hmsa.report.paper import KINDS, named, Paper
+from hmsa.report.looks import case, CASES, KINDS, LineStyle, named, Paper, SHAPERS
 from hmsa.report.picture import draw, draw_bands
 from hmsa_studies.sweep_pictures import label_of, worded
 

@@ -42,15 +42,7 @@ from hmsa.report.page import page
 from hmsa.report.picture import draw
 from hmsa.runs.bags import read_run, read_runs
 from hmsa.runs.record import described, in_force, RecordedLevel, without_repeats
-from hmsa.runs.topics import (
-    APPLIED,
-    COMMAND,
-    JOINT_STATES,
-    OUTCOMES,
-    PLAN,
-    STATUS,
-    TYPES,
-)
+from hmsa.runs.topics import APPLIED, COMMAND, JOINT_STATES, OUTCOMES, PLAN, STATUS, TYPES
 from hmsa.runs.verify import verify
 
 rosbag2, typesys = needs('rosbags.rosbag2'), needs('rosbags.typesys')

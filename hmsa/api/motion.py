@@ -134,7 +134,7 @@ class Motion:
             With ``ax``: stretch over time, flux density over time, or rate over stretch.
         **more
             ``width`` and ``height`` in mm, ``letters`` in pt, ``dpi``, ``panels``, and ``data``
-            for a CSV file of the curves; see `hmsa.report.paper.Paper`. With ``ax``, properties
+            for a CSV file of the curves; see `hmsa.report.looks.Paper`. With ``ax``, properties
             of the line, such as ``color`` and ``label`` (default the name of the motion).
 
         Returns
@@ -336,7 +336,7 @@ def compare(
 def _draw(runs: list[Run], path: Any, paper: Mapping[str, Any]) -> Any:
     """Draw runs in one set of axes; return the Matplotlib figure."""
     from hmsa.report.comparison import parts_of
-    from hmsa.report.paper import Paper
+    from hmsa.report.looks import Paper
     from hmsa.report.picture import draw
 
     paths = [] if path is None else [file_of(x) for x in several(path)]

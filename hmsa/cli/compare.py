@@ -20,7 +20,7 @@ from hmsa.cli.terminal import progress
 from hmsa.errors import BadInputError
 
 if TYPE_CHECKING:
-    from hmsa.report.paper import Paper
+    from hmsa.report.looks import Paper
 
 
 def add_parser(subparsers: Any) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from hmsa.cli.options import Row
 from hmsa.files import check_targets
-from hmsa.report.paper import kind_of, KINDS, kinds_in, PANELS, Paper, WIDE
+from hmsa.report.looks import kind_of, KINDS, kinds_in, PANELS, Paper, WIDE
 
 _ENDS = f'{", ".join(f".{x}" for x in KINDS[:-1])} or .{KINDS[-1]}'
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from hmsa.model.equations import Array, elastic_force
 from hmsa.model.residual import RESOLVED
-from hmsa.report import looks, paper
+from hmsa.report import looks
 from hmsa.report.arrivals import around, left_text, Part, results_of, span, worst
 from hmsa.report.figures import Axis, Curve, decimate, Panel, TimeCurve
 from hmsa.report.looks import BLACK, BLUE, LineStyle, VERMILION
@@ -490,6 +490,6 @@ _TIMINGS = {
         'interval as recorded': LineStyle(VERMILION, 0.7, (2.0, 1.0)),
         'interval of the timestamps': LineStyle(BLACK, 1.2, order=3)}}
 
-#: The panels of runs, by their paper.PANELS in `hmsa.report.paper`.
-PANELS: Mapping[str, Callable[[Sequence[Part]], list[Panel]]] = dict(zip(paper.PANELS, (
+#: The panels of runs, by their names in `hmsa.report.looks`.
+PANELS: Mapping[str, Callable[[Sequence[Part]], list[Panel]]] = dict(zip(looks.PANELS, (
     command, response, phase, errors, residuals, deviations, timings), strict=True))

@@ -16,7 +16,7 @@ from hmsa.report import charts, looks, style
 from hmsa.report.arrivals import around, Part, results_of, span
 from hmsa.report.charts import error_axis
 from hmsa.report.figures import Axis, Curve, Panel
-from hmsa.report.paper import NARROW, Paper, WIDE
+from hmsa.report.looks import NARROW, Paper, WIDE
 
 # Panels that share the axis of time, above each other; those beside them; and those below, beside
 # each other.

@@ -30,7 +30,7 @@ import numpy as np
 from hmsa.files import replacing
 from hmsa.report import looks
 from hmsa.report.figures import Axis, Curve, Panel
-from hmsa.report.paper import INCH, kind_of, Paper
+from hmsa.report.looks import INCH, kind_of, Paper
 
 SHAPED, UNSHAPED, TARGET, ARRIVAL = (
     x.line() for x in (looks.RECORDED, looks.PLAIN, looks.TARGET, looks.ARRIVAL))

@@ -9,9 +9,8 @@ from hmsa.identification.delays import Delays, response
 from hmsa.model.equations import Array
 from hmsa.report import looks, style
 from hmsa.report.figures import Axis, Curve, Figure, Panel
-from hmsa.report.looks import BLACK, BLUE, LineStyle
+from hmsa.report.looks import BLACK, BLUE, LineStyle, Paper
 from hmsa.report.page import document
-from hmsa.report.paper import Paper
 from hmsa.table import Column, Table
 from hmsa_lab.bench.calibration import CoilCalibration, Statics
 from hmsa_lab.bench.conformance import Conformance

@@ -101,7 +101,7 @@ def _carry_out(
 def second_act(picture: Path) -> tuple[AdaptingResult, ...]:
     """Run the moves with feedback off and cautious, and plot both."""
     from hmsa.report import looks, style
-    from hmsa.report.paper import SCREEN
+    from hmsa.report.looks import SCREEN
 
     block = paper_actuator()
     block = replace(
@@ -177,7 +177,7 @@ def run_demo(folder: Path, progress: Callable[[str, float], None]) -> DemoResult
 def _evaluate(bag: Path, picture: Path) -> tuple[SetpointResult, ...]:
     """Read the run from the bag, evaluate and plot it."""
     from hmsa.report.arrivals import Part
-    from hmsa.report.paper import SCREEN
+    from hmsa.report.looks import SCREEN
     from hmsa.report.picture import draw
 
     run, = read_runs(bag)

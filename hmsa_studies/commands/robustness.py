@@ -149,7 +149,7 @@ def _write(
         folder: Path, studies: 'list[tuple[Case, list[Result]]]',
         arguments: argparse.Namespace) -> list[Path]:
     """Write the numbers and the figures."""
-    from hmsa.report.paper import named
+    from hmsa.report.looks import named
     from hmsa_studies.pictures import draw_front, draw_robustness
     from hmsa_studies.robustness import write_csv
 

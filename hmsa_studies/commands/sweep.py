@@ -23,7 +23,7 @@ from hmsa.cli.options import add_command, MATERIAL
 from hmsa.cli.pictures import formats_of, paper_of, picture_options
 from hmsa.cli.terminal import progress
 from hmsa.errors import BadInputError, check_choice
-from hmsa.report.paper import named, Paper
+from hmsa.report.looks import named, Paper
 from hmsa_studies.commands import chunked
 
 if TYPE_CHECKING:
