@@ -38,10 +38,9 @@ from hmsa.planning.planner import Options, Planner
 from hmsa.planning.timeline import PlannedSegment
 from hmsa.runs.record import ROUNDED
 from hmsa_lab.bench import _board, line, serial_board
-from hmsa_lab.bench.assembly import Assembly, CoilModel, SensorScale
+from hmsa_lab.bench.assembly import Assembly, CoilModel, fit_core, SensorScale
 from hmsa_lab.bench.calibration import calibrate_coil, decay, loop
-from hmsa_lab.bench.iron_core import fit_core
-from hmsa_lab.bench.simulated_board import REST_LENGTH, SimulatedBoard, TESLA_PER_AMPERE
+from hmsa_lab.bench.serial_board import REST_LENGTH, SimulatedBoard, TESLA_PER_AMPERE
 from hmsa_lab.experiments.tuning import chosen, excitation, identified, Tuning
 from hmsa_ros.device.watchdog import Fallback
 from hmsa_ros.device.worker import HardwareDevice, HardwareJoint

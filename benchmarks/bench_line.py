@@ -34,7 +34,7 @@ from benchmarks.sheet import Sheet
 from hmsa.errors import HmsaError
 from hmsa.model.equations import elastic_force
 from hmsa_lab.bench.assembly import CoilModel
-from hmsa_lab.bench.simulated_board import TESLA_PER_AMPERE
+from hmsa_lab.bench.serial_board import TESLA_PER_AMPERE
 from hmsa_ros.device.watchdog import Kind
 
 RUNS, SEED = 20, 33_000

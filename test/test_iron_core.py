@@ -7,9 +7,8 @@ from benchmarks.laboratory import Iron
 from hmsa.cli import main
 from hmsa.errors import BadInputError
 from hmsa.runs.parameters import entries_of
-from hmsa_lab.bench.assembly import Assembly, CoilModel, parts
+from hmsa_lab.bench.assembly import Assembly, CoilModel, fit_core, IronCore, parts
 from hmsa_lab.bench.calibration import loop
-from hmsa_lab.bench.iron_core import fit_core, IronCore
 
 LARGEST, SLOPE = 0.14, 0.05
 MS = 1_000_000

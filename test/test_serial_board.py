@@ -21,8 +21,15 @@ from hmsa.cli import main
 from hmsa.errors import HmsaError
 from hmsa.interfaces import topics
 from hmsa_lab.bench import _board, serial_board
-from hmsa_lab.bench.serial_board import Board, BoardError, framed, SerialBoard
-from hmsa_lab.bench.simulated_board import REST_LENGTH, SimulatedBoard, TESLA_PER_AMPERE
+from hmsa_lab.bench.serial_board import (
+    Board,
+    BoardError,
+    framed,
+    REST_LENGTH,
+    SerialBoard,
+    SimulatedBoard,
+    TESLA_PER_AMPERE,
+)
 from hmsa_ros.device.watchdog import Fallback, Kind
 from hmsa_ros.device.worker import HardwareDevice, HardwareJoint
 

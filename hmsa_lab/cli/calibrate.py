@@ -106,8 +106,8 @@ def _coil(arguments: argparse.Namespace) -> int:
 
     example: hmsa calibrate coil my_lab:Coil --limit 0.1 --out coil.yaml
     """
+    from hmsa_lab.bench.assembly import fit_core
     from hmsa_lab.bench.calibration import calibrate_coil
-    from hmsa_lab.bench.iron_core import fit_core
 
     source, out = Path(arguments.source), arguments.out
     # Whether the table beside the file is written depends on the readings.
