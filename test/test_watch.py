@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from hmsa.interfaces.status import StatusVerdict
-from hmsa_lab.watch.scene import as_json, JointView, line, PeakHistory, Report, Scene, SLOTS
+from hmsa_lab.watch.listener import as_json, JointView, line, PeakHistory, Report, Scene, SLOTS
 
 WAIT_SECONDS = 60.0
 

@@ -19,8 +19,7 @@ from hmsa.ending import ENDING
 from hmsa.errors import check_number
 
 if TYPE_CHECKING:
-    from hmsa_lab.watch.listener import Listener
-    from hmsa_lab.watch.scene import Scene
+    from hmsa_lab.watch.listener import Listener, Scene
 
 # Interval of lines, and of looks in between, in s.
 _LINE_SECONDS = 1.0
@@ -78,6 +77,6 @@ def _once(listener: 'Listener', arguments: argparse.Namespace) -> int:
 
 def _print(scene: 'Scene', as_object: bool) -> None:
     """Print a scene as a line of text, or as a JSON object."""
-    from hmsa_lab.watch.scene import as_json, line
+    from hmsa_lab.watch.listener import as_json, line
 
     print(json.dumps(as_json(scene)) if as_object else line(scene), flush=True)
