@@ -15,9 +15,8 @@ from hmsa.model.actuators import Setup
 from hmsa.model.parameters import paper_actuator
 from hmsa.model.sensor import Delay, Sample, Sensor, SensorErrors
 from hmsa.model.simulation import ActuatorSimulation
-from hmsa_ros.device.interlock import judge_commands
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
-from hmsa_ros.device.watchdog import Fallback, GuardedJoint, Kind
+from hmsa_ros.device.watchdog import Fallback, GuardedJoint, judge_commands, Kind
 
 ACTUATOR = paper_actuator()
 MS = 1_000_000

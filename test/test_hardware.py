@@ -11,8 +11,7 @@ import pytest
 from hmsa.errors import BadInputError, HmsaError
 from hmsa_ros.device import StateLostError
 from hmsa_ros.device.hardware import Calls, ClockMap, load
-from hmsa_ros.device.interlock import judge_hardware
-from hmsa_ros.device.watchdog import Fallback, Kind
+from hmsa_ros.device.watchdog import Fallback, judge_hardware, Kind
 from hmsa_ros.device.worker import HardwareDevice, HardwareJoint, HardwareWorker
 
 MS = 1_000_000

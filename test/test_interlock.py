@@ -13,8 +13,7 @@ from test_runtime_planner import Rig, trajectory
 from hmsa.errors import BadInputError
 from hmsa.interfaces import topics
 from hmsa_ros.device import StateLostError
-from hmsa_ros.device.interlock import Interlock
-from hmsa_ros.device.watchdog import Fallback, Kind
+from hmsa_ros.device.watchdog import Fallback, Interlock, Kind
 from hmsa_ros.device.worker import HardwareDevice, HardwareJoint
 from hmsa_ros.runtime.records import Stop, StretchRequest
 

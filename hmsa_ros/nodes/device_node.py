@@ -17,8 +17,7 @@ from hmsa.interfaces import topics
 from hmsa.interfaces.parameters import JOINT, LATENESS_LIMIT, ParameterSpec
 from hmsa.model.sensor import Sample
 from hmsa.model.units import NANOSECONDS
-from hmsa_ros.device.interlock import judge_commands
-from hmsa_ros.device.watchdog import Change, Fallback, Kind, Notice, SAFE_FLUX
+from hmsa_ros.device.watchdog import Change, Fallback, judge_commands, Kind, Notice, SAFE_FLUX
 from hmsa_ros.device.worker import STALL
 from hmsa_ros.nodes import conversions, ros_entities
 from hmsa_ros.nodes.capture import decode, FastPublisher, RawSubscription

@@ -18,7 +18,7 @@ from hmsa.interfaces.parameters import ParameterSpec, PUBLISH_RATE
 from hmsa.model.units import NANOSECONDS
 from hmsa_ros.device.coil import HardwareJoint
 from hmsa_ros.device.hardware import Calls, load, OPTIONAL
-from hmsa_ros.device.interlock import Interlock, judge_hardware, judge_interlock
+from hmsa_ros.device.watchdog import Interlock, judge_hardware, judge_interlock
 from hmsa_ros.device.worker import HardwareDevice, HardwareWorker
 from hmsa_ros.nodes import conversions, ros_entities
 from hmsa_ros.nodes.capture import decode
