@@ -22,7 +22,7 @@ from hmsa.model.simulation import sampled
 from hmsa.model.status import Code
 from hmsa.motion import STRETCH
 from hmsa.planning.two_step import plan_two_step
-from hmsa_studies.settings import Setting
+from hmsa_studies.axes import Setting
 
 __all__ = ['Actual', 'arrival_of', 'Errors']
 

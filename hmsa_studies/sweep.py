@@ -29,9 +29,17 @@ from hmsa.planning.sequence import plan_sequence
 from hmsa.planning.shapers import get_shaper
 from hmsa.planning.shapers.request import MoveRequest
 from hmsa.planning.two_step import CODES, Groups, plan_two_step_batch
-from hmsa_studies.axes import parse_grid, SweepAxis, View
+from hmsa_studies.axes import (
+    FINITE,
+    Nondimensional,
+    parse_grid,
+    Range,
+    Setting,
+    SweepAxis,
+    System,
+    View,
+)
 from hmsa_studies.residual import Actual, arrival_of
-from hmsa_studies.settings import FINITE, Nondimensional, Range, Setting, System
 from hmsa_studies.study_folder import LEAST_ROWS, MOST_ROWS
 
 #: All codes; plans contain their indices.

@@ -17,8 +17,7 @@ from hmsa.interfaces.parameters import PLANNED
 from hmsa.model.equations import Array
 from hmsa.report import looks, style
 from hmsa.report.looks import Paper
-from hmsa_studies.axes import SweepAxis, View
-from hmsa_studies.settings import ACTUAL, BLOCK_OF, Nondimensional
+from hmsa_studies.axes import ACTUAL, BLOCK_OF, Nondimensional, SweepAxis, View
 
 #: Quantiles of the samples that limit the bands, and the quantile that maps show.
 BANDS, MAPPED = ((0.05, 0.95), (0.25, 0.75)), 0.95

@@ -22,9 +22,16 @@ from hmsa.planning.shapers.request import MoveRequest
 from hmsa.planning.shapers.two_step import two_step
 from hmsa.planning.two_step import Groups, plan_two_step_batch
 from hmsa.runs.parameters import read_parameter_file, values_of
-from hmsa_studies.axes import draw, NormalColumns, NOTHING, parse_values, Spread
+from hmsa_studies.axes import (
+    draw,
+    InSI,
+    Nondimensional,
+    NormalColumns,
+    NOTHING,
+    parse_values,
+    Spread,
+)
 from hmsa_studies.residual import Actual, Errors
-from hmsa_studies.settings import InSI, Nondimensional
 from hmsa_studies.sweep import Sweep
 
 ACTUATOR = {

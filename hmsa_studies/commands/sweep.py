@@ -156,8 +156,19 @@ class _SweepPicture:
 
 def _sweep(arguments: argparse.Namespace) -> 'Sweep':
     """Return the sweep of the arguments."""
-    from hmsa_studies.axes import belief_of, draw, NOTHING, parse_values, read_cases, Spread
-    from hmsa_studies.settings import ACTUAL, BLOCK_OF, InSI, Nondimensional, System
+    from hmsa_studies.axes import (
+        ACTUAL,
+        belief_of,
+        BLOCK_OF,
+        draw,
+        InSI,
+        Nondimensional,
+        NOTHING,
+        parse_values,
+        read_cases,
+        Spread,
+        System,
+    )
     from hmsa_studies.sweep import Sweep
 
     system: System = Nondimensional()
