@@ -51,7 +51,7 @@ from hmsa.planning.sequence import plan_sequence, Setpoint  # noqa: E402
 from hmsa.planning.shapers import get_shaper  # noqa: E402
 from hmsa.planning.two_step import plan_two_step  # noqa: E402
 from hmsa.report import looks, style  # noqa: E402
-from hmsa.report.arrivals import Part  # noqa: E402
+from hmsa.report.comparison import Part  # noqa: E402
 from hmsa.report.looks import SCREEN  # noqa: E402
 from hmsa.report.picture import draw  # noqa: E402
 from hmsa.runs.record import described, RecordedLevel, Run  # noqa: E402

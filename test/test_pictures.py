@@ -19,8 +19,8 @@ from hmsa.errors import BadInputError
 from hmsa.interfaces.topics import FLUX_DENSITY_COMMAND
 from hmsa.model.residual import percent
 from hmsa.report import style
-from hmsa.report.arrivals import Part
 from hmsa.report.charts import commanded, PANELS
+from hmsa.report.comparison import Part
 from hmsa.report.figures import decimate, through, TimeCurve
 from hmsa.report.looks import case, CASES, KINDS, LineStyle, named, Paper, SHAPERS
 from hmsa.report.picture import draw, draw_bands

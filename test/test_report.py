@@ -34,8 +34,8 @@ from hmsa.model.residual import percent, residual_vibration
 from hmsa.model.simulation import ActuatorSimulation, simulate
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.planner import Options, Planner
-from hmsa.report.arrivals import Part
 from hmsa.report.charts import MOST_PANELS
+from hmsa.report.comparison import Part
 from hmsa.report.evaluation import evaluate, findings_of, level_results, plan_points
 from hmsa.report.figures import BUCKETS, decimate
 from hmsa.report.page import page

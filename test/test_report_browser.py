@@ -9,7 +9,7 @@ import pytest
 from test_report import ACTUATOR, applied, parameters, parts_of, simulated, write
 
 from hmsa.model.units import NANOSECONDS
-from hmsa.report.arrivals import Part
+from hmsa.report.comparison import Part
 from hmsa.report.page import page
 from hmsa.runs.bags import read_runs
 

@@ -101,8 +101,7 @@ class Motion:
         ['arrived', 'arrived']
 
         """
-        from hmsa.report.arrivals import Part
-        from hmsa.report.comparison import setpoints
+        from hmsa.report.comparison import Part, setpoints
 
         part = Part.of(self.run)
         if path is not None:
@@ -317,8 +316,7 @@ def compare(
         raise BadInputError(
             f'got {excerpt(list(motions))} to compare: expected two motions or more, as read and '
             'simulate return them')
-    from hmsa.report.arrivals import Part
-    from hmsa.report.comparison import comparison
+    from hmsa.report.comparison import comparison, Part
 
     found = comparison([Part.of(x.run) for x in motions])
     if picture is not None:

@@ -62,8 +62,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _compare_repeats(
         arguments: argparse.Namespace, groups: 'list[list[Path]]', paper: 'Paper') -> int:
     """Compare runs of which at least one was repeated."""
-    from hmsa.report.arrivals import Part
-    from hmsa.report.comparison import statistics, statistics_table
+    from hmsa.report.comparison import Part, statistics, statistics_table
     from hmsa.runs.bags import read_run
 
     labels = [x.parent.name if x.name == 'run' else x.name for x in map(

@@ -23,8 +23,8 @@ from hmsa.model.parameters import ActuatorParameters
 from hmsa.model.residual import percent
 from hmsa.model.units import NANOSECONDS
 from hmsa.report import charts, looks
-from hmsa.report.arrivals import NOT_MOVED, Part, residual_text, title, worst
 from hmsa.report.charts import TimeUnit
+from hmsa.report.comparison import NOT_MOVED, Part, residual_text, title, worst
 from hmsa.report.evaluation import FEW_SAMPLES, plan_points, verdict_on
 from hmsa.report.figures import BUCKETS, Figure
 from hmsa.runs.record import Run

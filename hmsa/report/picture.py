@@ -13,8 +13,8 @@ import numpy as np
 from hmsa.errors import BadInputError
 from hmsa.model.equations import Array
 from hmsa.report import charts, looks, style
-from hmsa.report.arrivals import around, Part, results_of, span
 from hmsa.report.charts import error_axis
+from hmsa.report.comparison import around, Part, results_of, span
 from hmsa.report.figures import Axis, Curve, Panel
 from hmsa.report.looks import NARROW, Paper, WIDE
 

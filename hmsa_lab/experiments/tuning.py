@@ -28,8 +28,7 @@ from hmsa.interfaces.parameters import ACTUATOR_FIELDS
 from hmsa.interfaces.topics import PLANNER
 from hmsa.judge.records import worst
 from hmsa.model.parameters import ActuatorParameters
-from hmsa.report.arrivals import Part
-from hmsa.report.comparison import ringing
+from hmsa.report.comparison import Part, ringing
 from hmsa.runs.bags import read_run
 from hmsa.runs.parameters import Entries
 from hmsa.runs.record import Run

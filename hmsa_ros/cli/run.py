@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from hmsa.judge.records import Finding, Tolerances
-    from hmsa.report.arrivals import Part
+    from hmsa.report.comparison import Part
     from hmsa.report.evaluation import LevelResult
     from hmsa_ros.clients.experiment import Conducted, Experiment
 
@@ -138,7 +138,7 @@ def _carried_out(
     if not done.measured:
         return done, [], None
     update('evaluating the bag', None)
-    from hmsa.report.arrivals import Part
+    from hmsa.report.comparison import Part
     from hmsa.runs.bags import read_runs
 
     parts = [Part.of(x, tolerances=tolerances) for x in read_runs(

@@ -176,7 +176,7 @@ def run_demo(folder: Path, progress: Callable[[str, float], None]) -> DemoResult
 
 def _evaluate(bag: Path, picture: Path) -> tuple[SetpointResult, ...]:
     """Read the run from the bag, evaluate and plot it."""
-    from hmsa.report.arrivals import Part
+    from hmsa.report.comparison import Part
     from hmsa.report.looks import SCREEN
     from hmsa.report.picture import draw
 
