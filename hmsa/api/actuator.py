@@ -12,33 +12,22 @@ from numpy.typing import ArrayLike
 
 from hmsa.api.arguments import (
     columns_of,
-    DAMPED,
     file_of,
     grid_of,
-    limits_of,
     mapping_of,
     number,
     numbers,
-    parameters_in,
     setpoints_of,
     suggesting,
     whole,
 )
-from hmsa.api.facts import facts, further_facts, unquestioned, warn, with_mount
+from hmsa.api.facts import facts, unquestioned, warn
+from hmsa.api.models import checked, DAMPED, limits_of, model_of, parameters_in
 from hmsa.errors import assume, BadInputError, check_choice, UnusualWarning
 from hmsa.files import write_text, yaml_text
-from hmsa.interfaces.actuator import actuator_from, model_from, parameters_of
-from hmsa.interfaces.parameters import (
-    ACTUATOR_FIELDS,
-    CREEP_TOLERANCE,
-    FLUX_DENSITY_MAX,
-    LAW_NAME,
-    PLANNED,
-    VISCOELASTIC,
-    ZETA,
-)
+from hmsa.interfaces.actuator import parameters_of, planned_from
+from hmsa.interfaces.parameters import ACTUATOR_FIELDS, FLUX_DENSITY_MAX, LAW_NAME, ZETA
 from hmsa.interfaces.topics import PLANNER
-from hmsa.model.delivery import IDEAL
 from hmsa.model.equations import Array, critical_zeta, elastic_force, equilibrium_stretch
 from hmsa.model.mismatch import Uncertainty
 from hmsa.model.moves import Setpoint, State
@@ -48,7 +37,7 @@ from hmsa.planning.sequence import plan_sequence
 from hmsa.planning.shapers import get_shaper
 from hmsa.planning.shapers.request import as_errors, ERRORS, MoveRequest, SmoothLimits
 from hmsa.planning.timeline import JointModel
-from hmsa.runs.parameters import read_parameter_file, values_of
+from hmsa.runs.parameters import read_parameter_file
 from hmsa.table import Column, Table
 
 if TYPE_CHECKING:
@@ -57,8 +46,6 @@ if TYPE_CHECKING:
     from hmsa.identification.files import Belief
 
 _STRONGEST: Any = FLUX_DENSITY_MAX.default
-# Plans made here need not be sent, so the levels are very fine unless a file sets the tolerance.
-_SPECS = (*PLANNED, *VISCOELASTIC, replace(CREEP_TOLERANCE, default=IDEAL.ripple))
 
 
 class Actuator:
@@ -145,18 +132,12 @@ class Actuator:
             slew_limit: float = math.inf, coil_time_constant: float = 0.0,
             mount: str = 'paper', thermal: Mapping[str, float] | None = None) -> None:
         given = {
-            'shear_modulus': shear_modulus, 'density': density, 'half_length': half_length,
-            'half_thickness': half_length if half_thickness is None else half_thickness,
-            'remanence': remanence, 'chain_limit': chain_limit, 'zeta': zeta,
-            'damping_ratio': damping_ratio, 'damping_coefficient': damping_coefficient,
-            'law': law, 'constants': constants, 'creep': creep, 'bulk_ratio': bulk_ratio,
-            'flux_density_limits': flux_density_limits, 'slew_limit': slew_limit,
-            'coil_time_constant': coil_time_constant, 'thermal': thermal}
+            **locals(),
+            'half_thickness': half_length if half_thickness is None else half_thickness}
         if all(given[x] is None for x in DAMPED):
             zeta = ZETA
         #: Parameters that plans are made with.
-        self.model = with_mount(
-            _model(parameters_in(given), zeta, damping_ratio), mount, damping_ratio)
+        self.model = model_of(parameters_in(given), zeta, damping_ratio, mount)
         self._belief: Belief | Path | None = None
         warn(self)
 
@@ -178,7 +159,7 @@ class Actuator:
 
         """
         return cls._of(
-            _model(mapping_of(values, 'parameters', "'actuator.remanence': 0.1")), belief)
+            model_of(mapping_of(values, 'parameters', "'actuator.remanence': 0.1")), belief)
 
     @classmethod
     def _of(cls, model: JointModel, belief: 'Belief | Path | None' = None) -> 'Actuator':
@@ -366,8 +347,7 @@ class Actuator:
 
         """
         return Table(
-            (Column('quantity'), Column('value')),
-            (*facts(self.scales, self.block), *further_facts(self.block)))
+            (Column('quantity'), Column('value')), tuple(facts(self.scales, self.block)))
 
     def __repr__(self) -> str:
         size = ' x '.join(f'{2e3 * x:.4g}' for x in (
@@ -416,19 +396,17 @@ class Actuator:
         """
         for name in parameters:
             check_choice('a parameter to replace', name, _KEYS)
-        mount = parameters.pop('mount', 'paper')
         changed = parameters_in(parameters, self.law)
         # A new model, new branches or coefficients replace all previous ones.
         groups = ('law',) * (changed[LAW_NAME.name] != self.law) + (
             'viscoelastic',) * ('creep' in parameters) + (
             'thermal',) * ('thermal' in parameters)
         zeta = self.zeta if parameters.get('zeta') is None else parameters['zeta']
-        made = self._of(_model(
+        made = self._of(model_of(
             {x: y for x, y in self.parameters.items()
              if x.partition('.')[0] not in groups} | changed,
             None if 'actuator.damping_coefficient' in changed else zeta,
-            parameters.get('damping_ratio')))
-        made.model = with_mount(made.model, mount, parameters.get('damping_ratio'))
+            parameters.get('damping_ratio'), parameters.get('mount', 'paper')))
         warn(made)
         return made
 
@@ -462,9 +440,9 @@ class Actuator:
         """
         for name in factors:
             check_choice('a parameter to scale', name, ACTUATOR_FIELDS)
-        block = actuator_from(_checked(self.parameters) | {
-            f'mismatch.{name}': number(x, f'the factor on {name}') for name, x in factors.items()})
-        return self._of(JointModel(replace(block, creep=self.block.creep), self.model.options))
+        return self._of(JointModel(planned_from(checked(self.parameters) | {
+            f'mismatch.{name}': number(x, f'the factor on {name}')
+            for name, x in factors.items()}), self.model.options))
 
     def at_temperature(self, temperature: float) -> 'Actuator':
         """
@@ -855,23 +833,3 @@ class Actuator:
 
 
 _KEYS = tuple(x for x in Actuator.__init__.__annotations__ if x != 'return')
-
-
-def _model(
-        values: Mapping[str, Any], zeta: float | None = None,
-        ratio: float | None = None) -> JointModel:
-    """Return the planning model of parameters; zeta or a ratio replace the damping coefficient."""
-    if ratio is not None:
-        undamped = _model(values, 0.0).material
-        zeta = number(ratio, 'damping_ratio', least=0.0) * float(
-            critical_zeta(undamped.rest, undamped))
-    if zeta is not None:
-        unit = actuator_from(_checked(values)).damping_unit
-        values = {**values, 'actuator.damping_coefficient': unit * number(
-            zeta, 'zeta', least=0.0)}
-    return model_from(_checked(values))
-
-
-def _checked(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return all parameters that a plan needs, checked and with defaults."""
-    return values_of({f'{PLANNER}.{x}': y for x, y in values.items()}, PLANNER, _SPECS)

@@ -11,23 +11,10 @@ from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
-from hmsa.errors import BadInputError, check_choice, check_number, excerpt, meant
-from hmsa.interfaces.parameters import (
-    ACTUATOR,
-    BULK_RATIO,
-    COIL_TIME_CONSTANT,
-    LAW_NAME,
-    THERMAL,
-)
+from hmsa.errors import BadInputError, check_number, excerpt, meant
 from hmsa.model.equations import Array
-from hmsa.model.laws import LAWS
 from hmsa.model.moves import check_target
 
-#: Arguments of `Actuator` of which one describes the damping.
-DAMPED = ('zeta', 'damping_ratio', 'damping_coefficient')
-# Arguments of `Actuator` that are single numbers, and those that may be None.
-_NUMBERS = {x.name.rpartition('.')[2]: x for x in (*ACTUATOR, BULK_RATIO, COIL_TIME_CONSTANT)}
-_OPTIONAL = ('shear_modulus', 'half_thickness', *DAMPED, 'constants', 'thermal')
 # Shortest period of a command grid in s.
 _FINEST = 1e-9
 #: Alternative names of columns.
@@ -259,102 +246,3 @@ def number(
 def several(value: Any) -> list[Any]:
     """Return the items as a list; a single item becomes a list of one."""
     return list(value) if np.iterable(value) and not isinstance(value, str) else [value]
-
-
-def parameters_in(given: Mapping[str, Any], law: str = 'gent') -> dict[str, Any]:
-    """
-    Return the node parameters for arguments of `Actuator`, except zeta and the damping ratio.
-
-    The constants belong to the model in ``given``, else to ``law``.
-
-    Raises
-    ------
-    BadInputError
-        If an argument has the wrong type, or some of them exclude each other.
-
-    """
-    given = {x: y for x, y in given.items() if y is not None or x not in _OPTIONAL}
-    damped = [x for x in DAMPED if x in given]
-    if len(damped) > 1:
-        raise BadInputError(f'both {" and ".join(damped)} are given: expected one of them')
-    values: dict[str, Any] = {
-        x.name: number(given[name], name, x.unit) for name, x in _NUMBERS.items() if name in given}
-    values |= _law_values(
-        given.get('law', law), given.get('constants'), 'shear_modulus' in given)
-    if 'creep' in given:
-        values |= _creep_values(given['creep'])
-    if 'thermal' in given:
-        values |= _thermal_values(given['thermal'])
-    if 'flux_density_limits' in given:
-        values['flux_density_min'], values['flux_density_max'] = limits_of(
-            given['flux_density_limits'])
-    if 'slew_limit' in given:
-        slew = number(given['slew_limit'], 'slew_limit', 'T/s')
-        check_number('slew_limit', slew, 'T/s', above=0.0, endless=True)
-        values['slew_limit'] = 0.0 if math.isinf(slew) else slew
-    return values
-
-
-def _law_values(name: Any, constants: Any, modulus_given: bool) -> dict[str, Any]:
-    """Return the parameters of a model; a number is accepted for a constant that is a list."""
-    check_choice('law', name, LAWS)
-    law = LAWS[name]
-    constants = mapping_of(constants, 'constants', "'mu': 5e3")
-    names = {x.name.partition('.')[2]: x for x in law.constants}
-    unknown = [x for x in constants if x not in names]
-    if unknown:
-        raise BadInputError(
-            f'law {name} has no constant {unknown[0]!r}: expected '
-            + (', '.join(names) or 'none') + meant(unknown[0], names))
-    if modulus_given and law.scaled is not None:
-        raise BadInputError(
-            f'shear_modulus is given with law {name}, whose constants it follows from: expected '
-            f'constants={{...}} of {", ".join(names)} alone')
-    values: dict[str, Any] = {LAW_NAME.name: name}
-    for key, value in constants.items():
-        kind = names[key].kind
-        values[names[key].name] = (
-            number(value, key, names[key].unit) if kind is float
-            else [number(x, key, names[key].unit) for x in several(value)] if kind is list
-            else str(value))
-    return values
-
-
-def _creep_values(creep: Any) -> dict[str, Any]:
-    """Return the parameters of viscoelastic branches, pairs of stiffness ratio and time."""
-    if isinstance(creep, (tuple, list)) and not creep:
-        return {}
-    ratios, times = columns_of(creep, ('ratio', 'time'), 'branches of creep')
-    return {'viscoelastic.ratio': ratios.tolist(), 'viscoelastic.time': times.tolist()}
-
-
-def _thermal_values(thermal: Any) -> dict[str, Any]:
-    """Return the parameters ``thermal.*`` of values by name."""
-    known = {x.name.partition('.')[2]: x for x in THERMAL}
-    values = {}
-    for name, value in mapping_of(thermal, 'thermal coefficients', "'remanence': -1e-3").items():
-        check_choice('a thermal coefficient', name, known)
-        values[known[name].name] = number(value, f'thermal {name}', known[name].unit)
-    return values
-
-
-def limits_of(limits: Any) -> tuple[float, float]:
-    """
-    Return the minimum and the maximum flux density in T.
-
-    Raises
-    ------
-    BadInputError
-        If they are no numbers or not in increasing order.
-
-    """
-    given = [number(x, 'a flux density limit', 'T') for x in several(limits)]
-    if len(given) not in (1, 2):
-        raise BadInputError(
-            f'limits are {excerpt(limits)}: expected minimum and maximum flux density '
-            'in T, or one number for both directions')
-    low, high = given if len(given) == 2 else (-given[0], given[0])
-    if not low < high:
-        raise BadInputError(
-            f'flux densities from {low:g} to {high:g} T: expected the minimum below the maximum')
-    return low, high

@@ -1,26 +1,23 @@
-"""
-What an actuator is: its modes as a continuum, derived quantities as text, implausible values.
-
-As a continuum, a block is free or glued, a beam clamped.
-"""
+"""What follows from the values of an actuator, as text: derived quantities, and doubts."""
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import replace
 import math
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hmsa.errors import assume, BadInputError, UnusualWarning
-from hmsa.interfaces.actuator import actuator_from, along_elastica, parameters_of
+from hmsa.api.models import CLAMPED, clamped_beam
+from hmsa.errors import assume, UnusualWarning
+from hmsa.interfaces.actuator import actuator_from, parameters_of
 from hmsa.interfaces.quantities import FORMS
-from hmsa.model.continuum import check_mount, clamped, mounted, SHAPES, spectrum
+from hmsa.model.continuum import SHAPES, spectrum
 from hmsa.model.equations import critical_zeta, elastic_force, equilibrium_stretch
 from hmsa.model.laws import LAWS
 from hmsa.model.laws.record import ENDLESS
-from hmsa.model.modes import Modes, MOUNTS
+from hmsa.model.modes import Modes
 from hmsa.model.moves import State
 from hmsa.model.parameters import ActuatorParameters
 from hmsa.model.simulation import observed, sampled
@@ -28,7 +25,6 @@ from hmsa.model.units import flux_text
 from hmsa.planning.scales import Scales
 from hmsa.planning.shapers import get_shaper
 from hmsa.planning.shapers.request import MoveRequest
-from hmsa.planning.timeline import JointModel
 
 if TYPE_CHECKING:
     from hmsa.api.actuator import Actuator
@@ -44,7 +40,6 @@ _SILENT: ContextVar[bool] = ContextVar('silent', default=False)
 # Moves from rest of which the vibration is told, of a block and of a beam; time in natural
 # periods, and samples, in which it is looked for.
 _MOVE, _BEND, _PERIODS, _LOOK = 0.1, 0.3, 2.0, 400
-_PAPER, *_BLOCK, _CLAMPED = MOUNTS
 
 
 @contextmanager
@@ -125,69 +120,6 @@ def _of_sizes(form: str, values: Mapping[str, float]) -> Iterator[str]:
                 'with sides of similar length; a thin film or a long rod bends instead')
 
 
-def with_mount(model: JointModel, mount: Any, ratio: float | None) -> JointModel:
-    """
-    Return the model with factors and modes of a mounted actuator.
-
-    ``ratio`` is the damping ratio of the first mode; by default, the damping coefficient stays.
-    Raise `BadInputError` for an unknown mount or one of another actuator, or a shape that is out
-    of range.
-    """
-    actuator = model.actuator
-    check_mount(mount)
-    if mount == _PAPER:
-        return model
-    if (actuator.rest == 0.0) is not (mount == _CLAMPED):
-        form, others = ('beam', [_CLAMPED]) if actuator.rest == 0.0 else ('block', _BLOCK)
-        raise BadInputError(
-            f'mount {mount} is given for a {form}: expected {", ".join([_PAPER, *others])}')
-    if actuator.modes or any(x != 1.0 for x in actuator.factors.values()):
-        raise BadInputError(
-            f'mount {mount} is given for an actuator that already has modes: expected mount '
-            'alone, which computes them')
-    return JointModel((_clamped if mount == _CLAMPED else _held)(actuator, mount, ratio), (
-        model.options))
-
-
-def _held(block: ActuatorParameters, mount: str, ratio: float | None) -> ActuatorParameters:
-    """Return a block with its modes."""
-    shape = block.half_thickness / block.half_length
-    given = math.inf if block.law is not None else block.chain_limit
-
-    def made(damping_ratio: float) -> ActuatorParameters:
-        found = mounted(shape, mount, given, damping_ratio, block.bulk_ratio)
-        return replace(
-            block, shear_modulus=block.shear_modulus * found.stiffness,
-            mass_factor=found.mass_factor, transverse_mass_factor=found.transverse_mass_factor,
-            transverse_mass_exponent=found.transverse_mass_exponent, modes=found.modes)
-
-    ratio, coefficient = _damped(made(0.0), ratio)
-    return replace(made(ratio), damping_coefficient=coefficient)
-
-
-def _clamped(beam: ActuatorParameters, _: str, ratio: float | None) -> ActuatorParameters:
-    """Return a beam along its elastica, with its second mode."""
-    made = along_elastica(beam)
-    ratio, coefficient = _damped(made, ratio)
-    return replace(made, damping_coefficient=coefficient, modes=clamped(ratio))
-
-
-def _damped(made: ActuatorParameters, ratio: float | None) -> tuple[float, float]:
-    """Return damping ratio and coefficient for a given ratio, by default for the coefficient."""
-    material = made.nondimensional
-    critical = float(critical_zeta(material.rest, material))
-    if ratio is None:
-        return material.zeta / critical, made.damping_coefficient
-    return ratio, ratio * critical * made.damping_unit
-
-
-def further_facts(actuator: ActuatorParameters) -> list[tuple[str, str]]:
-    """Return names and values of what modes and compressibility change; none without them."""
-    if actuator.rest == 0.0:
-        return _facts_of_beam(actuator)
-    return _facts_of_volume(actuator) + _facts_of_modes(actuator)
-
-
 def _facts_of_volume(block: ActuatorParameters) -> list[tuple[str, str]]:
     """Return what a compressible block changes, and what is left if this is ignored."""
     if math.isinf(block.bulk_ratio):
@@ -240,13 +172,13 @@ def _facts_of_modes(actuator: ActuatorParameters) -> list[tuple[str, str]]:
 def _facts_of_beam(beam: ActuatorParameters) -> list[tuple[str, str]]:
     """Return what the first mode alone leaves, and with secondary modes, what they change."""
     first = actuator_from(parameters_of(replace(beam, modes=Modes())) | {'law.shape': ''})
-    actual = beam if beam.modes else _clamped(replace(beam, mass_factor=1.0), '', None)
+    actual = beam if beam.modes else clamped_beam(replace(beam, mass_factor=1.0))
     load = elastic_force(_BEND, first.nondimensional)
     off = 100.0 * (float(equilibrium_stretch(load, actual.nondimensional)) / _BEND - 1.0)
     left = (f'leaves {_left(actual, first):.2g} % of a step to {_BEND:g}, and rests '
             f'{abs(off):.2g} % off')
     if not beam.modes:
-        return [('two_step, as an elastica', f'{left}; mount {_CLAMPED} and shaper modal, none')]
+        return [('two_step, as an elastica', f'{left}; mount {CLAMPED} and shaper modal, none')]
     return [
         ('modes, f/f1 (share)', _modes_text(beam.modes)),
         ("two_step, mode's shape", left),
@@ -278,7 +210,11 @@ def _left(
 
 
 def facts(found: Scales, block: ActuatorParameters) -> list[tuple[str, str]]:
-    """Return names and values, with units, of the derived quantities."""
+    """
+    Return names and values, with units, of the derived quantities.
+
+    The last ones say what modes and compressibility change.
+    """
     beam, words = block.rest == 0.0, block.coordinate.plural
     return [
         ('time unit' if beam or block.geometry.inertia != 1.0 else 'time unit L sqrt(rho/G)',
@@ -296,7 +232,8 @@ def facts(found: Scales, block: ActuatorParameters) -> list[tuple[str, str]]:
         ('two-step range from rest', 'none' if found.reached == (block.rest,) * 2
          else '{:.6g} to {:.6g}'.format(*found.reached)),
         ('move time from rest', 'no two-step command' if math.isnan(found.duration)
-         else f'{_time_text(found.duration)} to {found.target:.6g}')]
+         else f'{_time_text(found.duration)} to {found.target:.6g}'),
+        *(_facts_of_beam(block) if beam else _facts_of_volume(block) + _facts_of_modes(block))]
 
 
 def _time_text(seconds: float) -> str:

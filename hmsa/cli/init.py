@@ -119,7 +119,7 @@ def run(arguments: argparse.Namespace) -> int:
         if not _known(quantity.key, given):
             given[quantity.key] = default_of(quantity, given)
     from hmsa.api.facts import doubts as doubts_of
-    from hmsa.api.facts import facts, further_facts
+    from hmsa.api.facts import facts
 
     made = _actuator(form, given, arguments.law, arguments.mount)
     found = made.scales
@@ -132,8 +132,7 @@ def run(arguments: argparse.Namespace) -> int:
             f'{"; ".join(shown)} {"is a guess" if len(missing) == 1 else "are guesses"}: a plan '
             'is only as exact as its parameters; measure them and pass the values')
     parameters = _parameters(made)
-    table = [f'{name:<26} {value}' for name, value in [
-        *facts(found, made.block), *further_facts(made.block)]]
+    table = [f'{name:<26} {value}' for name, value in facts(found, made.block)]
     write_text(path, '\n'.join([
         '# Parameters of an actuator for planner and plant, written by hmsa init:',
         *(f'#   hmsa {x} --ros-args --params-file {quote(path.name)}' for x in _NODES),
