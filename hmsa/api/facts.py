@@ -143,7 +143,7 @@ def _facts_of_volume(block: ActuatorParameters) -> list[tuple[str, str]]:
 def _first(block: ActuatorParameters) -> list[tuple[str, str]]:
     """Return the first frequency of a free block, which does not deform uniformly."""
     shape = block.half_thickness / block.half_length
-    if block.modes or not SHAPES[0] <= shape <= SHAPES[1]:
+    if block.modes.ratios or not SHAPES[0] <= shape <= SHAPES[1]:
         return []
     found = spectrum(shape, 'free', bulk_ratio=block.bulk_ratio)
     unit = block.half_length * math.sqrt(block.density / block.shear_modulus)
@@ -155,7 +155,7 @@ def _first(block: ActuatorParameters) -> list[tuple[str, str]]:
 
 def _facts_of_modes(actuator: ActuatorParameters) -> list[tuple[str, str]]:
     """Return what the modes of a block change."""
-    if not actuator.modes:
+    if not actuator.modes.ratios:
         return []
     paper = replace(
         actuator, mass_factor=1.0, transverse_mass_factor=1.0, transverse_mass_exponent=0.0,
@@ -172,12 +172,12 @@ def _facts_of_modes(actuator: ActuatorParameters) -> list[tuple[str, str]]:
 def _facts_of_beam(beam: ActuatorParameters) -> list[tuple[str, str]]:
     """Return what the first mode alone leaves, and with secondary modes, what they change."""
     first = actuator_from(parameters_of(replace(beam, modes=Modes())) | {'law.shape': ''})
-    actual = beam if beam.modes else clamped_beam(replace(beam, mass_factor=1.0))
+    actual = beam if beam.modes.ratios else clamped_beam(replace(beam, mass_factor=1.0))
     load = elastic_force(_BEND, first.nondimensional)
     off = 100.0 * (float(equilibrium_stretch(load, actual.nondimensional)) / _BEND - 1.0)
     left = (f'leaves {_left(actual, first):.2g} % of a step to {_BEND:g}, and rests '
             f'{abs(off):.2g} % off')
-    if not beam.modes:
+    if not beam.modes.ratios:
         return [('two_step, as an elastica', f'{left}; mount {CLAMPED} and shaper modal, none')]
     return [
         ('modes, f/f1 (share)', _modes_text(beam.modes)),

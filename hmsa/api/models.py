@@ -172,7 +172,7 @@ def _mounted(actuator: ActuatorParameters, mount: str, ratio: float | None) -> A
         form, others = ('beam', [CLAMPED]) if actuator.rest == 0.0 else ('block', _BLOCK)
         raise BadInputError(
             f'mount {mount} is given for a {form}: expected {", ".join([_PAPER, *others])}')
-    if actuator.modes or any(x != 1.0 for x in actuator.factors.values()):
+    if actuator.modes.ratios or any(x != 1.0 for x in actuator.factors.values()):
         raise BadInputError(
             f'mount {mount} is given for an actuator that already has modes: expected mount '
             'alone, which computes them')

@@ -165,7 +165,7 @@ class Designer:
         least, most = bounds.of_motion(actuator)
         self._free = quantities.check_free(free, actuator.law)
         if quantities.MODES in self._free:
-            actuator = actuator if actuator.modes else replace(actuator, modes=EXPECTED)
+            actuator = actuator if actuator.modes.ratios else replace(actuator, modes=EXPECTED)
             self._free = modal_free(actuator, self._free)
             # Modes change with the stretch, so that large motion would blur them.
             low, high = (x * abs(actuator.rest or 1.0) for x in _SMALL)
@@ -174,7 +174,7 @@ class Designer:
         # The last move brings the first mode to rest, and the others fade. Short dwells would
         # feed the modes that nobody expects.
         self._last, self._still, self._shortest = (
-            _LAST, _REST, _LEAST_DWELL) if not actuator.modes else (
+            _LAST, _REST, _LEAST_DWELL) if not actuator.modes.ratios else (
             2.0 * _LAST, _MODAL_REST, _MODAL_DWELL)
         self._actuator, self._bounds, self._noise = actuator, bounds, noise
         self._values = quantities.values_of(actuator)

@@ -146,7 +146,7 @@ class Actuators:
         self._material[i, :len(group.packed)] = group.packed
         if len(self._branches):
             self._branches[i, :len(group.rows)] = group.rows
-        if group.modes:
+        if group.modes.ratios:
             self._modes[i] = group, len(group.branches)
 
     def set_temperature(self, i: int, setup: Setup, temperature: float) -> None:

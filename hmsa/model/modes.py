@@ -94,7 +94,7 @@ class Modes:
             'modes.frequency_ratio': list(self.ratios), 'modes.share': list(self.shares),
             'modes.damping_ratio': list(self.dampings),
             'modes.ratio_exponent': list(self.exponents),
-            'modes.share_exponent': list(self.share_exponents)} if self else {}
+            'modes.share_exponent': list(self.share_exponents)} if self.ratios else {}
 
     @property
     def numbers(self) -> list[tuple[float, ...]]:
@@ -159,10 +159,6 @@ class Modes:
             [share, ratio, kind, damping, exponent, 0.0]
             for ratio, share, damping, exponent, _ in self.numbers
             for kind in (_POSITION, _RATE)]
-
-    def __bool__(self) -> bool:
-        """Return whether there are secondary modes."""
-        return bool(self.ratios)
 
     @cached_property
     def ringing(self) -> tuple[int, ...]:

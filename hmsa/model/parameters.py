@@ -131,7 +131,7 @@ class NondimensionalParameters:
     @cached_property
     def rows(self) -> NDArray[np.float64]:
         """Branches, then two rows for each secondary mode, for `hmsa.motion`, shape (n, 6)."""
-        if not self.modes:
+        if not self.modes.ratios:
             return self.branches
         return np.concatenate([self.branches, np.array(self.modes.rows())])
 

@@ -231,7 +231,7 @@ def draft_stop(start: PlanStart) -> Draft:
     # A coil that must not step brakes as the shaper smooth does, from the turning point on, and a
     # block with modes as modal does.
     own = model.options.shaper if model.options.shaper == 'smooth' or (
-        model.options.shaper == 'modal' and model.material.modes) else ''
+        model.options.shaper == 'modal' and model.material.modes.ratios) else ''
     if (not own and holdable(model, found.stretch) == found.stretch
             and not model.material.creeps
             and (model.delivery.ideal or found.duration == 0.0 and _settled(model, state))):

@@ -70,7 +70,7 @@ def modal(request: MoveRequest) -> Move:
     whole = (_SPAN * request.order - _LESS) * 0.5 * sum(
         _half_period(request.material, x) for x in (request.state.stretch, request.target))
     request = _of_ringing(request)
-    if not request.material.modes:
+    if not request.material.modes.ratios:
         return two_step(request)
     holding = request.holding_load()
     if at_rest(request) and _modes_rest(request):
