@@ -1,5 +1,6 @@
-"""A coil and its sensor on the bench: levels to apply, and their results."""
+"""A coil and its sensor on the bench, also simulated ones: levels to apply, and their results."""
 
+from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 import math
@@ -10,11 +11,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hmsa.errors import BadInputError, HmsaError
+from hmsa.model.actuators import Setup
 from hmsa.model.equations import Array
-from hmsa.model.sensor import Sample
+from hmsa.model.parameters import paper_actuator
+from hmsa.model.sensor import Sample, SensorErrors
 from hmsa.model.units import NANOSECONDS
 from hmsa_ros.device.coil import Coil, HardwareJoint
 from hmsa_ros.device.hardware import Calls, load
+from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.device.watchdog import Change, Fallback
 from hmsa_ros.device.worker import HardwareDevice, HardwareWorker
 
@@ -23,6 +27,10 @@ from hmsa_ros.device.worker import HardwareDevice, HardwareWorker
 LEAD, _BEAT, SILENCE, _START, _LOOK = 0.1, 0.05, 1.0, 10.0, 2e-3
 # Number of further waits for a level that has not been set.
 _PATIENCE = 10
+# Sampling period in ns, and number of samples stored for a probe.
+_PERIOD, _KEPT = 1_000_000, 100_000
+# Fields for `SimulatedProbe`, with their times in ns.
+_FIELDS: deque[tuple[float, float, int]] = deque(maxlen=_KEPT)
 
 
 class PhaseResults(NamedTuple):
@@ -160,3 +168,57 @@ def matched(seen: PhaseResults) -> list[tuple[Change, tuple[int, float]]]:
             found.append((near[0], (stamp, level)))
             changes.remove(near[0])
     return found
+
+
+class SimulatedBench:
+    """
+    Hardware that applies scheduled levels; times in s.
+
+    Parameters
+    ----------
+    joint : str
+        Joint name.
+    transport, lag, latency : float
+        Delay and first-order lag of the field, and lateness of the timestamps of samples.
+    noise : float
+        Standard deviation of a stretch sample.
+
+    """
+
+    def __init__(
+            self, joint: str, transport: float = 5e-4, lag: float = 5e-4, latency: float = 2e-3,
+            noise: float = 1e-3) -> None:
+        self.description = 'simulated'
+        self._transport, self._latency = (
+            round(x * NANOSECONDS) for x in (transport, latency))
+        self._device = SimulatedDevice(
+            [SimulatedJoint(
+                Setup(paper_actuator(), coil_time_constant=lag),
+                errors=SensorErrors(stretch_noise=noise))],
+            period=_PERIOD, time=time_ns(), measurement_delay=self._latency)
+        _FIELDS.clear()
+
+    def schedule(self, levels: list[tuple[int, float]]) -> None:
+        """Schedule levels."""
+        for stamp, level in levels:
+            self._device.receive(0, stamp + self._transport, level)
+
+    def write(self, level: float, now: int) -> int:
+        """Set a level now."""
+        self._device.receive(0, now + self._transport, level)
+        return now
+
+    def read(self, now: int) -> list[tuple[float, float, int]]:
+        """Return the samples that have arrived."""
+        self._device.advance(now)
+        samples = self._device.samples()
+        _FIELDS.extend((float(x.flux_density[0]), math.nan, x.time) for x in samples)
+        return [(float(x.stretch[0]), math.nan, x.time + self._latency) for x in samples]
+
+
+class SimulatedProbe:
+    """A probe in the coil of the simulated bench."""
+
+    def read(self) -> list[tuple[float, float, int]]:
+        """Return field in T, NaN, and time in ns of each sample since the last call."""
+        return [_FIELDS.popleft() for _ in range(len(_FIELDS))]

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 # Number of readings of a probe that are averaged.
 _READINGS = 20
-_SIMULATED = 'hmsa_lab.bench.simulated_bench:'
+_SIMULATED = 'hmsa_lab.bench.bench:'
 # Fraction of the range below which hysteresis is negligible.
 _NO_HYSTERESIS = 1e-4
 # Largest remaining drift of the stretch at the end of a level, as a fraction of the range.
