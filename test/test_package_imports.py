@@ -55,7 +55,7 @@ PACKAGES = ('hmsa', 'hmsa_ros', 'hmsa_lab', 'hmsa_studies')
 # Rooms that import ROS.
 WITH_ROS = {
     'hmsa_ros.nodes', 'hmsa_ros.clients', 'hmsa_lab.nodes', 'hmsa_lab.experiments',
-    'hmsa_lab.watch', 'hmsa_lab.panel'}
+    'hmsa_lab.panel'}
 
 
 def rooms(package: str) -> list[str]:

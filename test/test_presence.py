@@ -10,7 +10,7 @@ from std_srvs.srv import Trigger
 from hmsa.cli import main
 from hmsa.interfaces import topics
 from hmsa.interfaces.status import StatusVerdict
-from hmsa_lab.watch.listener import Listener
+from hmsa_lab.panel.listener import Listener
 from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.conversions import to_trajectory
 from hmsa_ros.nodes.duplicate_nodes import Active

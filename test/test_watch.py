@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from hmsa.interfaces.status import StatusVerdict
-from hmsa_lab.watch.listener import as_json, JointView, line, PeakHistory, Report, Scene, SLOTS
+from hmsa_lab.panel.listener import as_json, JointView, line, PeakHistory, Report, Scene, SLOTS
 
 WAIT_SECONDS = 60.0
 
@@ -98,7 +98,7 @@ def test_each_joint_has_its_own_target_command_and_history(ros, ros_env, wait_un
     from std_msgs.msg import Header
 
     from hmsa.interfaces import topics
-    from hmsa_lab.watch.listener import Listener
+    from hmsa_lab.panel.listener import Listener
     from hmsa_ros.nodes import ros_entities
     from hmsa_ros.nodes.conversions import to_time
 
@@ -157,7 +157,7 @@ def test_garbage_on_its_topics_neither_ends_nor_misleads_it(ros, ros_env, wait_u
 
     from benchmarks.faults import garbage
     from hmsa.interfaces import topics
-    from hmsa_lab.watch.listener import Listener
+    from hmsa_lab.panel.listener import Listener
     from hmsa_ros.nodes import ros_entities
     from hmsa_ros.nodes.conversions import to_command
 

@@ -19,7 +19,7 @@ from hmsa.ending import ENDING
 from hmsa.errors import check_number
 
 if TYPE_CHECKING:
-    from hmsa_lab.watch.listener import Listener, Scene
+    from hmsa_lab.panel.listener import Listener, Scene
 
 # Interval of lines, and of looks in between, in s.
 _LINE_SECONDS = 1.0
@@ -42,7 +42,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Watch until the end is requested; raise `BadInputError` if an option is out of range."""
     check_number('timeout', arguments.timeout, 's', least=0.0, most=1e6)
 
-    from hmsa_lab.watch.listener import Listener
+    from hmsa_lab.panel.listener import Listener
 
     with Listener(
             namespace=arguments.namespace,
@@ -77,6 +77,6 @@ def _once(listener: 'Listener', arguments: argparse.Namespace) -> int:
 
 def _print(scene: 'Scene', as_object: bool) -> None:
     """Print a scene as a line of text, or as a JSON object."""
-    from hmsa_lab.watch.listener import as_json, line
+    from hmsa_lab.panel.listener import as_json, line
 
     print(json.dumps(as_json(scene)) if as_object else line(scene), flush=True)

@@ -1,6 +1,7 @@
 """
-A web page to operate the running nodes.
+The running nodes, as text or JSON, and on a web page that operates them.
 
-`server` serves the page to holders of its address, without ROS. `desk` carries out the commands of
-the page in the thread of the nodes; it also records and reports.
+`listener` collects their state. `server` serves the page to holders of its address, without ROS.
+`desk` carries out the commands of the page in the thread of the nodes; it also records and
+reports.
 """

@@ -25,8 +25,8 @@ from hmsa.files import finite
 from hmsa.interfaces import topics
 from hmsa.interfaces.status import real, texts
 from hmsa.interfaces.topics import DRIVER, INTERLOCK, RECORDER
+from hmsa_lab.panel.listener import as_json, LEVELS, Listener, PeakHistory, Scene, SLOTS
 from hmsa_lab.panel.server import Server
-from hmsa_lab.watch.listener import as_json, LEVELS, Listener, PeakHistory, Scene, SLOTS
 from hmsa_ros.clients.client import PlannerClient
 from hmsa_ros.clients.experiment import Experiment, prepare, recorder_of
 from hmsa_ros.clients.link import Stopping
