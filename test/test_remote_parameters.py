@@ -7,7 +7,7 @@ from rcl_interfaces.msg import ParameterValue
 from rcl_interfaces.srv import GetParameters, GetParameterTypes, ListParameters
 from rclpy.parameter import Parameter
 
-from hmsa.bag.experiment import parameter_key
+from hmsa.bag.metadata import parameter_key
 from hmsa.errors import BadInputError
 from hmsa_ros.clients.remote import RemoteNode
 from hmsa_ros.nodes.temporary_node import RemoteParameters

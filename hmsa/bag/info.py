@@ -7,7 +7,7 @@ import json
 import os
 
 from hmsa.bag import limits, qos
-from hmsa.bag.experiment import node_parameters, parameter_key
+from hmsa.bag.metadata import node_parameters, parameter_key
 from hmsa.bag.reader import BagReader
 from hmsa.errors import BagError, listed, printable
 

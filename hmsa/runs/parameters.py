@@ -5,7 +5,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-from hmsa.bag.experiment import recorded_parameters
 from hmsa.bag.limits import load_yaml
 from hmsa.errors import assume, BadInputError, BagError, excerpt
 from hmsa.files import read_at_most
@@ -32,6 +31,8 @@ def of_joint(parameters: Mapping[str, object], joint: str, name: str) -> object:
 
 def recorded(custom_data: Mapping[str, str], space: str) -> dict[str, object]:
     """Return the parameters of planner and plant in a namespace by ``'node.name'``."""
+    from hmsa.bag.metadata import recorded_parameters  # imports YAML
+
     parameters: dict[str, object] = {}
     for node in (PLANNER, PLANT):
         for name, text in recorded_parameters(custom_data, node, space).items():

@@ -19,7 +19,7 @@ from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.signals import SignalHandlerOptions
 from rclpy.validate_namespace import validate_namespace
 
-from hmsa.bag.experiment import parameter_key
+from hmsa.bag.metadata import parameter_key
 from hmsa.cli.terminal import under_way
 from hmsa.ending import ENDING
 from hmsa.errors import BadInputError, HmsaError
