@@ -2,7 +2,9 @@
 Response of the actuator to a command, sampled or step by step.
 
 Commands take effect exactly at their times: each piece between two changes of level is integrated
-separately.
+separately. Conversely, the stretch is a flat output: the equation of motion determines the load
+from a path of the stretch (M. Fliess, J. Lévine, P. Martin, P. Rouchon, Int. J. Control 61, 1327
+(1995)).
 """
 
 from collections.abc import Sequence
@@ -18,7 +20,7 @@ from hmsa.model import law
 from hmsa.model.actuators import Actuators, RTOL, Setup
 from hmsa.model.creep import Creep, MAXWELL
 from hmsa.model.delivery import Delivery, IDEAL, Piece, ramps
-from hmsa.model.equations import Array
+from hmsa.model.equations import acceleration, Array, elastic_force
 from hmsa.model.moves import Level, State
 from hmsa.model.parameters import ActuatorParameters, NondimensionalParameters
 from hmsa.model.schedule import CommandSchedule
@@ -381,3 +383,32 @@ def too_large(time: int, flux_density: float) -> str:
     """Return the message for a load that is too large to simulate, at a time in ns and in T."""
     return (f'the integration stopped at {time} ns under {flux_density:g} T: the load is too '
             'large to follow')
+
+
+def fade(share: Array) -> tuple[Array, Array, Array]:
+    """Return a polynomial from 0 to 1, flat to third order at both ends, and two derivatives."""
+    left = 1.0 - share
+    return (share ** 4 * (35.0 - 84.0 * share + 70.0 * share ** 2 - 20.0 * share ** 3),
+            140.0 * (share * left) ** 3, 420.0 * (share * left) ** 2 * (left - share))
+
+
+def loads_for(
+        stretch: Array, rate: Array, wanted: Array, material: NondimensionalParameters) -> Array:
+    """Return the loads for given accelerations, which are linear in the load, (n,) each."""
+    zero, one = (acceleration(stretch, rate, x, material) for x in (0.0, 1.0))
+    return (wanted - zero) / (one - zero)
+
+
+def held_along(
+        times: Array, stretch: Array, followed: tuple[float, ...],
+        material: NondimensionalParameters) -> tuple[Array, Array]:
+    """
+    Return the overstress (n,) of branches along a path, and the branch states (n, k).
+
+    Raise `HmsaError` if the branches cannot be integrated.
+    """
+    forces = elastic_force(stretch, material)
+    behind = np.empty((len(times), len(followed)))
+    if not motion.trail(times, forces, with_followed(material, followed), behind):
+        raise HmsaError(STUCK)
+    return (forces[:, np.newaxis] - behind) @ material.branches[:, motion.RATIO], behind

@@ -1,7 +1,7 @@
 """
 Paths of the stretch to follow, such as a dense trajectory with velocities.
 
-The stretch is a flat output (`hmsa.planning.inverse_dynamics`). Commands are steps of the load
+The stretch is a flat output (`hmsa.model.simulation`). Commands are steps of the load
 (zero-order hold) or ramps. The double integral of a sequence of steps is a quadratic spline, and
 the error of the stretch follows from the error of this double integral. The levels are therefore
 those whose spline is nearest, in the mean square, to the double integral of the load (of the
@@ -21,9 +21,8 @@ from hmsa import motion
 from hmsa.model import law
 from hmsa.model.equations import Array
 from hmsa.model.moves import Level, Move, State
-from hmsa.model.simulation import branches_of, follow, sampled
+from hmsa.model.simulation import branches_of, follow, held_along, loads_for, sampled
 from hmsa.model.status import Code, RefusedError
-from hmsa.planning.inverse_dynamics import held_along, loads_for
 from hmsa.planning.shapers.request import MoveRequest
 from hmsa.planning.shapers.two_step import two_step
 from hmsa.planning.shooting import Attempt, solve, Template, within_limits

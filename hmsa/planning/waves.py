@@ -14,7 +14,7 @@ import numpy as np
 from hmsa.errors import BadInputError
 from hmsa.model import law
 from hmsa.model.equations import Array, elastic_force
-from hmsa.planning.inverse_dynamics import fade, loads_for
+from hmsa.model.simulation import fade, loads_for
 from hmsa.planning.path import Path
 from hmsa.planning.shapers.request import MoveRequest
 

@@ -1,7 +1,7 @@
 """
 Moves without a step of the level: the level is computed from a smooth path of the stretch.
 
-The stretch is a flat output (`hmsa.planning.inverse_dynamics`): a path determines the load, and
+The stretch is a flat output (`hmsa.model.simulation`): a path determines the load, and
 one more derivative determines the amplifier level if the field lags. The path is the motion as it
 would continue under the present level, faded into the target by a polynomial with three zero
 derivatives at either end. It therefore starts with the present motion, field and level, and ends
@@ -19,9 +19,8 @@ from hmsa.errors import HmsaError
 from hmsa.model import law
 from hmsa.model.equations import acceleration, Array, elastic_force
 from hmsa.model.moves import Level, Move
-from hmsa.model.simulation import branches_of, sampled
+from hmsa.model.simulation import branches_of, fade, held_along, loads_for, sampled
 from hmsa.model.status import Code, RefusedError
-from hmsa.planning.inverse_dynamics import fade, held_along, loads_for
 from hmsa.planning.shapers.free import at_rest
 from hmsa.planning.shapers.request import MOST_PERIODS, MoveRequest
 from hmsa.planning.shooting import Attempt, solve, Template, within_limits
