@@ -58,21 +58,20 @@ _FORGET_SECONDS = 30.0
 class PeakHistory:
     """Minimum and maximum in each slot of the last ``span`` seconds, so that peaks are kept."""
 
-    def __init__(self, span: float, slots: int = SLOTS) -> None:
-        self._slot = span / slots
-        self._low = np.full(slots, np.nan)
-        self._high = np.full(slots, np.nan)
+    def __init__(self, span: float) -> None:
+        self._slot = span / SLOTS
+        self._low = np.full(SLOTS, np.nan)
+        self._high = np.full(SLOTS, np.nan)
         self._newest = 0
 
     def put(self, before: float, now: float, values: Array) -> None:
         """Add samples from between two looks (times in s), assumed evenly spaced."""
         self._advance(now)
-        count = len(self._low)
         times = before + (now - before) * np.arange(1, len(values) + 1) / max(len(values), 1)
         slots = np.floor(times / self._slot).astype(np.int64)
-        kept = slots > self._newest - count
-        np.fmin.at(self._low, slots[kept] % count, values[kept])
-        np.fmax.at(self._high, slots[kept] % count, values[kept])
+        kept = slots > self._newest - SLOTS
+        np.fmin.at(self._low, slots[kept] % SLOTS, values[kept])
+        np.fmax.at(self._high, slots[kept] % SLOTS, values[kept])
 
     def hold(self, before: float, now: float, value: float) -> None:
         """Add a value that was constant between two looks (times in s)."""
@@ -80,16 +79,15 @@ class PeakHistory:
         self.put(before, now, np.full(math.ceil((now - before) / self._slot) + 1, value))
 
     def _advance(self, now: float) -> None:
-        newest, count = math.floor(now / self._slot), len(self._low)
-        begun = np.arange(max(self._newest, newest - count) + 1, newest + 1) % count
+        newest = math.floor(now / self._slot)
+        begun = np.arange(max(self._newest, newest - SLOTS) + 1, newest + 1) % SLOTS
         self._low[begun] = self._high[begun] = np.nan
         self._newest = max(newest, self._newest)
 
     def ranges(self, now: float) -> tuple[Array, Array]:
         """Return minima and maxima by slot up to ``now`` in s; NaN if empty."""
         self._advance(now)
-        count = len(self._low)
-        order = np.arange(self._newest - count + 1, self._newest + 1) % count
+        order = np.arange(self._newest - SLOTS + 1, self._newest + 1) % SLOTS
         return self._low[order], self._high[order]
 
 
