@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from benchmarks.faults.rig import Rig, settled
+from benchmarks.faults.rig import Child, Rig, settled
 from benchmarks.faults.table import Fault, Seen
 
 #: Maximum residual of a move as planned, as a fraction of the step.
@@ -37,14 +37,15 @@ class Register(list[Fault]):
 def pair(
         rig: Rig, *, plant: Mapping[str, object] | None = None,
         planner: Mapping[str, object] | None = None,
-        remap: Mapping[str, str] | None = None, slow: float = 0.0) -> None:
-    """Start a plant and a planner and wait for both; if ``slow``, the plant drives time."""
+        remap: Mapping[str, str] | None = None, slow: float = 0.0) -> tuple[Child, Child]:
+    """Return a started plant and a planner, both ready; if ``slow``, the plant drives time."""
     led = {'publish_clock': True, 'real_time_factor': slow} if slow else {}
     # On the wall clock, a large lead keeps stalls of a busy machine from counting as faults.
     follows: dict[str, object] = {'use_sim_time': True} if slow else {'lead_time': PATIENT_LEAD}
-    rig.start('plant', {**led, **(plant or {})})
-    rig.start('planner', {**follows, **(planner or {})}, remap)
+    started = (rig.start('plant', {**led, **(plant or {})}),
+               rig.start('planner', {**follows, **(planner or {})}, remap))
     rig.ready('plant', 'planner')
+    return started
 
 
 def move(

@@ -68,9 +68,7 @@ def _planner_killed(rig: Rig) -> Seen:
     'planner_restarted', 'planner killed at rest, restarted',
     'at stretch 1.3; a new planner, request of 1.1', 'no jump; the move starts from 1.3')
 def _planner_restarted(rig: Rig) -> Seen:
-    rig.start('plant')
-    planner = rig.start('planner', {'lead_time': PATIENT_LEAD})
-    rig.ready('plant', 'planner')
+    _, planner = pair(rig)
     move(rig, 1.3, start=1.0)
     planner.end(signal.SIGKILL)
     mark = rig.count()
@@ -88,9 +86,7 @@ def _planner_restarted(rig: Rig) -> Seen:
     'SIGSTOP, SIGCONT; a setpoint every 0.4 s, command_timeout 0.5 s',
     'watchdog reports, late commands counted, rest re-planned')
 def _planner_stopped(rig: Rig) -> Seen:
-    rig.start('plant', {'command_timeout': _TIMEOUT, 'safe_flux': 'hold'})
-    planner = rig.start('planner', {'lead_time': PATIENT_LEAD})
-    rig.ready('plant', 'planner')
+    _, planner = pair(rig, plant={'command_timeout': _TIMEOUT, 'safe_flux': 'hold'})
     rig.sequence([(1.1, 0.4), (1.2, 0.4), (1.3, 0.4), (1.2, 0.4), (1.4, 0.4)])
     rig.let_pass(0.5)
     planner.send(signal.SIGSTOP)
@@ -111,9 +107,7 @@ def _planner_stopped(rig: Rig) -> Seen:
     'SIGSTOP for 1.2 s in mid-sequence, SIGCONT; command_timeout 0.5 s, safe_flux zero',
     'no field until a request; status `cut_off`; the next move starts from the actual state')
 def _planner_stalled(rig: Rig) -> Seen:
-    rig.start('plant', {'command_timeout': _TIMEOUT, 'safe_flux': 'zero'})
-    planner = rig.start('planner', {'lead_time': PATIENT_LEAD})
-    rig.ready('plant', 'planner')
+    _, planner = pair(rig, plant={'command_timeout': _TIMEOUT, 'safe_flux': 'zero'})
     rig.sequence([(1.1, 0.4), (1.3, 0.4), (1.2, 0.4)] * 4)
     rig.let_pass(0.5)
     planner.send(signal.SIGSTOP)
@@ -134,9 +128,7 @@ def _planner_stalled(rig: Rig) -> Seen:
     'SIGSTOP for 1.2 s in mid-sequence, SIGCONT; command_timeout 0.5 s, safe_flux zero',
     'no alarm of the watchdog: the simulation catches up; at the last target in the end')
 def _plant_stalled(rig: Rig) -> Seen:
-    plant = rig.start('plant', {'command_timeout': _TIMEOUT, 'safe_flux': 'zero'})
-    rig.start('planner', {'lead_time': PATIENT_LEAD})
-    rig.ready('plant', 'planner')
+    plant, _ = pair(rig, plant={'command_timeout': _TIMEOUT, 'safe_flux': 'zero'})
     rig.sequence([(1.1, 0.4), (1.2, 0.4), (1.3, 0.4), (1.2, 0.4), (1.4, 0.4), (1.1, 1.0)])
     rig.let_pass(0.5)
     plant.send(signal.SIGSTOP)
