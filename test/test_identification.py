@@ -184,13 +184,6 @@ def test_nine_parameters_are_found_at_once():
         assert abs(x.value - true) < 4.0 * x.std, name
 
 
-def test_shaped_moves_alone_are_identified_with_a_warning():
-    found = identify(shaped(9), actuator=FAR)
-    assert found.verdict == 'identified', found.reason
-    assert max(map(abs, relative(found).values())) < 4.0
-    assert any('sixth of the information' in x for x in found.warnings)
-
-
 def test_search_among_slow_samples_of_shaped_moves_does_not_end_far_off():
     times = np.arange(400) / 200.0
     recording = Measurement(times, 1.0 + 0.1 * np.sin(70.0 * times), *levels_of(True, 15))
@@ -304,10 +297,14 @@ def test_what_the_sensor_does_rejects_the_model_by_name(change, word):
     assert word in found.reason
 
 
-def test_even_stamps_that_jitter_are_weighed_and_said():
-    found = identify(_jittering(recorded()))
+@pytest.mark.parametrize(('make', 'warning'), [
+    (lambda: shaped(9), 'sixth of the information'),
+    (lambda: _jittering(recorded()), 'timestamp errors of')],
+    ids=['shaped moves alone', 'stamps that jitter'])
+def test_what_determines_the_parameters_poorly_is_identified_with_a_warning(make, warning):
+    found = identify(make(), actuator=FAR)
     assert found.verdict == 'identified', found.reason
-    assert any('timestamp errors of' in x for x in found.warnings)
+    assert any(warning in x for x in found.warnings)
     assert max(map(abs, relative(found).values())) < 4.0
 
 
