@@ -67,13 +67,13 @@ class Plant:
         damping = block.damping_coefficient * block.half_thickness / (8.0 * block.half_length ** 2)
 
         def slope(_, state):
-            stretch, rate, relaxed, field = state
+            stretch, rate, relaxed, field = state.tolist()
             elastic = force_of(stretch, block.chain_limit)
             acting = field if self.lag else level
             total = (
                 block.remanence * acting / mu_0 - block.shear_modulus * (
                     elastic + self.ratio * (elastic - relaxed)) - damping * rate
-                + 0.25 * inertia * rate ** 2 / stretch ** 4)
+                + 0.25 * inertia * rate * rate / stretch ** 4)
             return [rate, total / (inertia * (stretch ** -3 + c1) / 6.0),
                     (elastic - relaxed) / self.tau,
                     (level - field) / self.lag if self.lag else 0.0]

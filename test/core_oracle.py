@@ -19,7 +19,7 @@ TOLERANCE = 1e-13
 
 def extension(stretch: float, j_lim: float) -> float:
     """Return the factor in the braces of Eq. 11, which vanishes at the limiting stretches."""
-    return 1.0 - (2.0 / stretch + stretch ** 2 - 3.0) / j_lim
+    return 1.0 - (2.0 / stretch + stretch * stretch - 3.0) / j_lim
 
 
 def holding_load(stretch: float, j_lim: float) -> float:
@@ -33,18 +33,20 @@ def stored_energy(stretch: float, j_lim: float) -> float:
 
 
 def equation(
-        load: float, zeta: float, j_lim: float, c1: float
+        load: float, zeta: float, j_lim: float, c1: float, slope: float = 0.0
 ) -> Callable[[float, Sequence[float]], list[float]]:
-    """Return the right-hand side of Eq. 11 with b^2 = load, of either sign."""
-    def right_hand_side(_: float, state: Sequence[float]) -> list[float]:
-        stretch, rate = state
-        cube = stretch ** 3
+    """Return the right-hand side of Eq. 11 with b^2 = load + slope t, of either sign."""
+    def right_hand_side(t: float, state: Sequence[float]) -> list[float]:
+        # Products of Python's numbers, which take half the time of those of NumPy.
+        stretch, rate = float(state[0]), float(state[1])
+        cube = stretch * stretch * stretch
         inertia = 1.0 + c1 * cube
         return [rate, (
-            1.5 * rate ** 2 / (stretch * inertia)
+            1.5 * rate * rate / (stretch * inertia)
             - 3.0 * zeta * c1 * cube * rate / inertia
             - 6.0 / inertia * (
-                (stretch ** 4 - stretch) / extension(stretch, j_lim) - load * cube))]
+                stretch * (cube - 1.0) / extension(stretch, j_lim)
+                - (load + slope * t) * cube))]
     return right_hand_side
 
 

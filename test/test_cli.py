@@ -276,8 +276,7 @@ def test_a_long_operation_says_what_is_under_way_and_how_long_where_no_bar_is_sh
         'starting ...', 'working (1 of 2) ...', 'closing ...']
 
 
-@pytest.mark.parametrize('name', [
-    x.name for x in registered(COMMANDS).values() if x.name not in registered(NODES)])
+@pytest.mark.parametrize('name', sorted({*registered(COMMANDS)} - {*registered(NODES)}))
 def test_a_command_says_what_it_does_from_its_start_on(name, capsys, wait_until, monkeypatch):
     words = [name, *{'param': ['get', 'planner'], 'bag': ['info', 'run'],
                      'calibrate': ['coil', 'lab:Coil', '--limit', '1'],

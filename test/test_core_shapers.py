@@ -55,12 +55,10 @@ def end_state(move: Move, request: MoveRequest) -> tuple[float, float, float]:
     ends = [*switches[1:], move.duration]
     for begin, end, load, slope in zip(switches, ends, loads, slopes, strict=True):
         if end > begin:
-            def motion(t, y, load=load, slope=slope, x=request.material):
-                return equation(load + slope * t, x.zeta, x.j_lim, x.c1)(t, y)
-
+            x = request.material
             state = ended(
-                motion, state, end - begin, rtol=INTEGRATION, atol=INTEGRATION,
-                seen=lambda _, y: passed.append(y[0]) or 0)
+                equation(load, x.zeta, x.j_lim, x.c1, slope), state, end - begin,
+                rtol=INTEGRATION, atol=INTEGRATION, seen=lambda _, y: passed.append(y[0]) or 0)
     stretch = np.array(passed)
     return float(state[0]), float(state[1]), np.nanmax(
         stretch * natural_frequency(stretch, request.material), initial=0.0)
