@@ -168,9 +168,10 @@ class AdaptiveJoint:
 
     @property
     def fitting(self) -> StateEstimate | None:
-        """The latest estimate if a whole move has shown that it fits."""
+        """The latest estimate if a whole move has shown that it fits, and only noise remains."""
         latest = self.latest
-        return latest if latest is not None and latest.trusted and self.trust.acts else None
+        return latest if latest is not None and latest.trusted and self.trust.acts and (
+            self.estimator.explains) else None
 
     @property
     def acting(self) -> StateEstimate | None:
@@ -577,8 +578,11 @@ class AdaptiveJoint:
         plan = self.planner.plan
         place = plan.under_way(now)
         target = plan.segments[place].stretch if place >= 0 else self.start
+        explains = self.estimator.explains
         use = 'plans do not use it' if self.sensor_changed else (
-            'plans use it' if trust.acts else 'plans use it after a move that samples fit')
+            'plans do not use it, since samples vibrate beside it: modes, or hysteresis'
+            if explains is False else 'plans use it' if explains and trust.acts
+            else 'plans use it after a move that samples fit')
         words = sentence(
             self.latest, self.prior.values, plan.level(now).flux_density, target,
             self.start, self.amplitude, use if self.adapts else '')
