@@ -189,7 +189,10 @@ def test_a_parameter_file_is_the_actuator_again(block, tmp_path):
     laws = hmsa.Actuator(
         law='ogden', constants={'mu': [6e3, 100.0], 'alpha': [1.3, 5.0]}, slew_limit=20.0,
         creep=[(0.1, 0.5)], flux_density_limits=(-0.1, 0.3))
-    for number, one in enumerate((block, laws, block.replace(chain_limit=np.inf))):
+    coarse = hmsa.Actuator.from_parameters(laws.parameters | {'creep_tolerance': 1e-3})
+    assert coarse.replace(zeta=0.3).model.options == coarse.model.options
+    assert len(coarse.plan([(1.05, 0.5)]).times) < len(laws.plan([(1.05, 0.5)]).times)
+    for number, one in enumerate((block, laws, block.replace(chain_limit=np.inf), coarse)):
         path = tmp_path / f'{number}.yaml'
         one.to_yaml(path)
         again = hmsa.Actuator.from_yaml(path)

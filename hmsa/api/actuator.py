@@ -26,8 +26,15 @@ from hmsa.api.models import checked, DAMPED, limits_of, model_of, parameters_in
 from hmsa.errors import assume, BadInputError, check_choice, UnusualWarning
 from hmsa.files import write_text, yaml_text
 from hmsa.interfaces.actuator import parameters_of, planned_from
-from hmsa.interfaces.parameters import ACTUATOR_FIELDS, FLUX_DENSITY_MAX, LAW_NAME, ZETA
+from hmsa.interfaces.parameters import (
+    ACTUATOR_FIELDS,
+    CREEP_TOLERANCE,
+    FLUX_DENSITY_MAX,
+    LAW_NAME,
+    ZETA,
+)
 from hmsa.interfaces.topics import PLANNER
+from hmsa.model.delivery import IDEAL
 from hmsa.model.equations import Array, critical_zeta, elastic_force, equilibrium_stretch
 from hmsa.model.mismatch import Uncertainty
 from hmsa.model.moves import Setpoint, State
@@ -262,7 +269,10 @@ class Actuator:
             'flux_density_min': options.flux_density_min,
             'flux_density_max': options.flux_density_max,
             'slew_limit': 0.0 if math.isinf(options.slew_limit) else options.slew_limit,
-            'coil_time_constant': options.coil_time_constant}
+            'coil_time_constant': options.coil_time_constant,
+            # Written only if it was given: nodes have another default (`models`).
+            **({} if options.creep_tolerance == IDEAL.ripple else {
+                CREEP_TOLERANCE.name: options.creep_tolerance})}
 
     @property
     def block(self) -> ActuatorParameters:
