@@ -36,15 +36,15 @@ from hmsa.planning.shooting import Attempt, heights, solve, Template, within_lim
 _LENGTHS = (1.0, 1.06, 0.94, 1.14, 1.25, 1.4, 1.6, 2.0)
 # Duration of each order in half periods of a block that deforms uniformly, and of all less; levels
 # at least, and at least for each order (benchmarks continuum).
-_SPAN, _LESS, _LEVELS, _MORE_LEVELS = 1.195, 0.1, 12, 4
+_SPAN, _LESS, _LEVELS, _MORE_LEVELS = 1.195, 0.1, 16, 4
 # For the expected vibration: relative error of all frequencies, weight of the bends, multiples of
 # the fastest ringing mode and of the mean of the weak ones between which these are, and where;
 # mean in units of the fastest and share of those that nobody gave.
-_ERROR, _BENT, _ABOVE, _BELOW, _WIDE = 0.03, 0.012, 1.1, 0.5, 1.5
-_BAND, _UNKNOWN = 24, (1.4, 0.05)
+_ERROR, _BENT, _ABOVE, _BELOW, _WIDE = 0.02, 0.003, 1.1, 0.5, 1.5
+_BAND, _UNKNOWN = 12, (1.4, 0.05)
 _PLACES: Array = np.linspace(0.0, 1.0, _BAND, dtype=np.float64)
 # Largest load beyond those of start and end, in units of the largest change that the motion needs.
-_BEYOND = 0.3
+_BEYOND = 0.6
 # Durations of levels in units of those of their ramps, at least.
 _MORE = 1.25
 # Motion below this fraction of the move is none for the guess.
