@@ -95,7 +95,7 @@ def remaining(request: MoveRequest, move: Move) -> Remaining | None:
     if seen is None:
         return None
     rows, whole = seen
-    parts = [abs(x) * np.ptp(y) for x, y in zip(modes.at(request.target), rows, strict=True)]
+    parts = np.abs(modes.at(request.target)) * np.ptp(rows, axis=1)
     most, vibration = int(np.argmax(parts)), float(np.ptp(whole)) / size
     if vibration < _TOLD:
         return None
