@@ -37,10 +37,10 @@ _LENGTHS = (1.0, 1.06, 0.94, 1.14, 1.25, 1.4, 1.6, 2.0)
 # Duration of each order in half periods of a block that deforms uniformly, and of all less; levels
 # at least, and at least for each order (benchmarks continuum).
 _SPAN, _LESS, _LEVELS, _MORE_LEVELS = 1.195, 0.1, 16, 4
-# For the expected vibration: relative error of all frequencies, weight of the bends, multiples of
-# the fastest ringing mode and of the mean of the weak ones between which these are, and where;
-# mean in units of the fastest and share of those that nobody gave.
-_ERROR, _BENT, _ABOVE, _BELOW, _WIDE = 0.02, 0.003, 1.1, 0.5, 1.5
+# For the expected vibration: relative error of all frequencies, weight of the bends by default and
+# from order 3 on, multiples of the fastest ringing mode and of the mean of the weak ones between
+# which these are, and where; mean in units of the fastest and share of those that nobody gave.
+_ERROR, _BENT, _ABOVE, _BELOW, _WIDE = 0.02, (0.003, 0.012), 1.1, 0.5, 1.5
 _BAND, _UNKNOWN = 12, (1.4, 0.05)
 _PLACES: Array = np.linspace(0.0, 1.0, _BAND, dtype=np.float64)
 # Largest load beyond those of start and end, in units of the largest change that the motion needs.
@@ -199,7 +199,8 @@ def _smooth(each: float, count: int, request: MoveRequest, weak: _Weak) -> Array
     others = np.stack([band, damping * band, np.full(_BAND, share / math.sqrt(_BAND))], axis=1)
     found = np.empty((1 + 2 * len(rings), count))
     solved = motion.smooth(
-        frequency * each, len(rings), np.concatenate([np.array(rings), others]), _BENT, found)
+        frequency * each, len(rings), np.concatenate([np.array(rings), others]),
+        _BENT[request.order > 2], found)
     return found if solved else None
 
 
