@@ -40,7 +40,7 @@ _SPAN, _LESS, _LEVELS, _MORE_LEVELS = 1.195, 0.1, 16, 4
 # For the expected vibration: relative error of all frequencies, weight of the bends by default and
 # from order 3 on, multiples of the fastest ringing mode and of the mean of the weak ones between
 # which these are, and where; mean in units of the fastest and share of those that nobody gave.
-_ERROR, _BENT, _ABOVE, _BELOW, _WIDE = 0.02, (0.003, 0.012), 1.1, 0.5, 1.5
+_ERROR, _BENT, _ABOVE, _BELOW, _WIDE = 0.025, (0.003, 0.012), 1.1, 0.5, 1.5
 _BAND, _UNKNOWN = 12, (1.4, 0.05)
 _PLACES: Array = np.linspace(0.0, 1.0, _BAND, dtype=np.float64)
 # Largest load beyond those of start and end, in units of the largest change that the motion needs.
