@@ -168,10 +168,16 @@ class AdaptiveJoint:
 
     @property
     def fitting(self) -> StateEstimate | None:
-        """The latest estimate if a whole move has shown that it fits, and only noise remains."""
+        """The latest estimate if a whole move has shown that it fits."""
         latest = self.latest
-        return latest if latest is not None and latest.trusted and self.trust.acts and (
-            self.estimator.explains) else None
+        return latest if latest is not None and latest.trusted and self.trust.acts and not (
+            self._unexplained) else None
+
+    @property
+    def _unexplained(self) -> bool:
+        """Whether a cautious joint waits, before its first confirmed move, until noise remains."""
+        return self.settings.cautious and self.trust.confirmed is None and (
+            not self.estimator.explains)
 
     @property
     def acting(self) -> StateEstimate | None:
@@ -578,10 +584,10 @@ class AdaptiveJoint:
         plan = self.planner.plan
         place = plan.under_way(now)
         target = plan.segments[place].stretch if place >= 0 else self.start
-        explains = self.estimator.explains
         use = 'plans do not use it' if self.sensor_changed else (
             'plans do not use it, since samples vibrate beside it: modes, or hysteresis'
-            if explains is False else 'plans use it' if explains and trust.acts
+            if self._unexplained and self.estimator.explains is False else 'plans use it'
+            if trust.acts and not self._unexplained
             else 'plans use it after a move that samples fit')
         words = sentence(
             self.latest, self.prior.values, plan.level(now).flux_density, target,
