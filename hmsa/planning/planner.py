@@ -19,7 +19,8 @@ from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning import drafting
 from hmsa.planning.drafting import Check, PathPoint, PlanStart, proceed
-from hmsa.planning.running import check_levels, draft_levels, RunningPlan
+from hmsa.planning.given_levels import check_levels, draft_levels
+from hmsa.planning.running import RunningPlan
 from hmsa.planning.timeline import Draft, JointModel, Options, PlannedLevel, Timeline
 from hmsa.planning.warmth import Warmth
 
