@@ -126,21 +126,6 @@ def test_remanence_and_coil_lag_are_found_beside_the_modulus():
         assert found.deviations[name] < 0.02 * value
 
 
-@pytest.mark.parametrize('ratio', [1.37, 2.0])
-def test_a_mode_that_the_model_lacks_shows_beside_the_estimate_and_noise_does_not(ratio):
-    block = replace(oracle.BLOCK, shear_modulus=1.1 * oracle.BLOCK.shear_modulus)
-    prior = Prior.nominal(oracle.BLOCK, suspects=True)
-    omega = ratio * np.sqrt(6.0) / oracle.BLOCK.time_unit
-    rings = np.zeros(len(SAMPLED))
-    for time, change in zip(TIMES[1:], np.diff(LEVELS), strict=True):
-        since = np.maximum(SAMPLED - time, 0.0)
-        rings += change / LEVELS[-2] * 0.04 * (since > 0.0) * np.exp(
-            -0.02 * omega * since) * np.cos(omega * since)
-    for seed in range(3):
-        assert run(measured(block, seed=seed), prior=prior)[0].explains
-        assert run(measured(block, seed=seed) + rings, prior=prior)[0].explains is False
-
-
 def test_samples_that_are_late_double_or_no_numbers_change_nothing():
     samples = measured(oracle.BLOCK)
     _, wanted = run(samples)

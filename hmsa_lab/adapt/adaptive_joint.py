@@ -170,14 +170,7 @@ class AdaptiveJoint:
     def fitting(self) -> StateEstimate | None:
         """The latest estimate if a whole move has shown that it fits."""
         latest = self.latest
-        return latest if latest is not None and latest.trusted and self.trust.acts and not (
-            self._unexplained) else None
-
-    @property
-    def _unexplained(self) -> bool:
-        """Whether a cautious joint waits, before its first confirmed move, until noise remains."""
-        return self.settings.cautious and self.trust.confirmed is None and (
-            not self.estimator.explains)
+        return latest if latest is not None and latest.trusted and self.trust.acts else None
 
     @property
     def acting(self) -> StateEstimate | None:
@@ -585,10 +578,7 @@ class AdaptiveJoint:
         place = plan.under_way(now)
         target = plan.segments[place].stretch if place >= 0 else self.start
         use = 'plans do not use it' if self.sensor_changed else (
-            'plans do not use it, since samples vibrate beside it: modes, or hysteresis'
-            if self._unexplained and self.estimator.explains is False else 'plans use it'
-            if trust.acts and not self._unexplained
-            else 'plans use it after a move that samples fit')
+            'plans use it' if trust.acts else 'plans use it after a move that samples fit')
         words = sentence(
             self.latest, self.prior.values, plan.level(now).flux_density, target,
             self.start, self.amplitude, use if self.adapts else '')

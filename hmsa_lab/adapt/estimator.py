@@ -63,11 +63,6 @@ _WAITING = 10
 CREEPS = 2.0
 # Parameters that plans compensate for by other levels, however small they are.
 _AS_IS = ('coil_time_constant', *BRANCHES[0])
-# Time scales after the last change of level of a move whose residuals are examined, at least so
-# many residuals, and the largest lag of their correlations; the sum of the squares of these, times
-# the number of residuals, that noise exceeds in one of 10^5 moves; and the vibration beside the
-# estimate, as a standard deviation relative to the motion, that is small (benchmarks harm).
-_EXAMINED, _FEWEST_EXAMINED, _LAGS, _CHANCE, _BESIDE = 12.0, 24, 10, 42.0, 5e-3
 # Fraction of the window that stays when it moves on, its maximum duration in time scales, and the
 # number of samples above which that applies.
 _KEPT, _LONGEST, _FEWEST = 0.5, 200.0, 20
@@ -178,8 +173,6 @@ class Estimator:
         self.screening = Screening(self.options.gate, prior.coordinate)
         # If False, parameters stay fixed from the next update on.
         self.learning = self.options.learn
-        #: Whether only noise remains of the newest move examined; None before the first one.
-        self.explains: bool | None = None
         # Covariance of the parameters while they are fixed.
         self._fixed: Array | None = None
         self._settled = True  # whether a window may begin at equilibrium
@@ -265,7 +258,6 @@ class Estimator:
             return None
         self._solution = found
         self._follow_noise(found)
-        self._examine(found, window)
         estimate = self._estimate(time, found, window)
         self._go_along(window, found, until)
         self._solution = self._solution.without_samples
@@ -403,31 +395,6 @@ class Estimator:
         gain = _NOISE_GAIN if self.noise < 3.0 * seen else 0.5
         self.noise = math.exp(
             (1.0 - gain) * math.log(self.noise) + gain * math.log(seen))
-
-    def _examine(self, found: Solution, window: Window) -> None:
-        """
-        Find whether what remains of the newest move is noise, by its correlations.
-
-        A mode that the model lacks, or hysteresis, remains as a vibration.
-        """
-        until = self._seconds(self.newest)
-        last = max((self._seconds(y[0]) for x, y in itertools.pairwise(self._levels)
-                    if x[1] != y[1] and self._seconds(y[0]) <= until), default=-math.inf)
-        if last < window.begin:
-            return
-        start, stop = np.searchsorted(window.time, (
-            self._seconds(self._move_begins(until)),
-            last + _EXAMINED * self.prior.values['time_unit']))
-        part = slice(start, max(stop, start + _FEWEST_EXAMINED))
-        left = np.clip(found.here.residual[part], -3.0 * self.noise, 3.0 * self.noise)
-        if len(left) < _FEWEST_EXAMINED:
-            return
-        square = max(float(left @ left), len(left) * _LEAST_NOISE ** 2)
-        alike = sum((float(left[x:] @ left[:-x]) / square) ** 2 for x in range(1, _LAGS + 1))
-        # The correlations of a sinusoid have half the square of its part of the residuals.
-        beside = math.sqrt(square / len(left) * math.sqrt(2.0 * alike / _LAGS))
-        self.explains = len(left) * alike < _CHANCE or (
-            beside < _BESIDE * float(np.ptp(found.here.motion.stretch[part])))
 
     def _estimate(self, time: int, found: Solution, window: Window) -> StateEstimate:
         state, covariance, off, doubt = found.at_end()
