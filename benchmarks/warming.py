@@ -5,13 +5,14 @@ The actuator is simulated with its temperature. The controller of the nodes move
 time, in open loop or with feedback, with or without the temperature.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hmsa.model.actuators import Setup
 from hmsa.model.parameters import ActuatorParameters, NondimensionalParameters
-from hmsa.model.sensor import SensorErrors
+from hmsa.model.sensor import Sample, SensorErrors
 from hmsa.model.simulation import ActuatorSimulation
 from hmsa.model.thermal import Thermal
 from hmsa.model.units import NANOSECONDS
@@ -58,6 +59,21 @@ class Left:
         return max(abs(self.offset), abs(self.drifted))
 
 
+class _Expanding(SimulatedDevice):
+    """One joint with a sensor of its length, which grows with the temperature."""
+
+    def __init__(
+            self, expansion: float, joints: Sequence[SimulatedJoint], *, period: int, time: int
+    ) -> None:
+        super().__init__(joints, period=period, time=time)
+        self._expansion, self._given = expansion, self.temperatures[0]
+
+    def samples(self) -> list[Sample]:
+        """Return the samples since the last call."""
+        by = 1.0 + self._expansion * (self.temperatures[0] - self._given)
+        return [x._replace(stretch=by * x.stretch) for x in super().samples()]
+
+
 def block() -> ActuatorParameters:
     """Return the block, which its coil warms by 15 K on the average of all levels."""
     made = ActuatorParameters.from_nondimensional(
@@ -71,7 +87,7 @@ def block() -> ActuatorParameters:
 
 def warming(
         way: str, *, stiffer: float = 0.0, coefficients: float = 1.0,
-        duration: float = DURATION) -> list[Left]:
+        expansion: float = 0.0, duration: float = DURATION) -> list[Left]:
     """
     Run the moves.
 
@@ -83,6 +99,8 @@ def warming(
         Relative error of the shear modulus that the planner is given.
     coefficients : float
         Factor on all coefficients that the planner is given.
+    expansion : float
+        Thermal expansion in 1/K of the length that the sensor measures.
     duration : float
         Duration of the run in s.
 
@@ -100,8 +118,9 @@ def warming(
         x: coefficients * getattr(known, x)
         for x in ('shear_modulus', 'remanence', 'damping_coefficient')})
     feedback = way.endswith('feedback')
-    device = SimulatedDevice(
-        [SimulatedJoint(Setup(truth), errors=SensorErrors(_NOISE if feedback else 0.0))],
+    errors = SensorErrors(_NOISE if feedback else 0.0)
+    device = _Expanding(
+        expansion, [SimulatedJoint(Setup(truth), errors=errors)],
         period=round((_FEEDBACK_PERIOD if feedback else _PERIOD) * NANOSECONDS),
         time=NANOSECONDS)
     planner = Planner(replace(

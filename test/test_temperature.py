@@ -276,6 +276,18 @@ def test_feedback_without_a_temperature_sensor_is_right_from_the_third_move_on(s
     assert max(x.worst for x in found) < 5e-3
 
 
+@pytest.mark.parametrize(('coefficients', 'expansion', 'duration'), [
+    (0.8, 0.0, 80.0), (1.2, 3e-4, 80.0), *(
+        pytest.param(*x, DURATION, marks=pytest.mark.slow) for x in (
+            (0.8, 0.0), (1.0, 3e-4)))])
+def test_feedback_with_a_temperature_sensor_corrects_coefficients_and_an_expanding_length(
+        coefficients, expansion, duration):
+    found = warming('measured and feedback', coefficients=coefficients, expansion=expansion,
+                    duration=duration)[2:]
+    assert max(x.vibration for x in found) < 5e-3
+    assert max(x.worst for x in found) < 5e-3
+
+
 @pytest.mark.slow
 def test_feedback_does_not_learn_again_what_a_measured_temperature_explains():
     found = warming('measured and feedback', stiffer=0.1)[1:]

@@ -125,9 +125,14 @@ _OF_LAWS = {
         advice='record larger stretches of both signs, and rest at three or more levels; or '
                'choose a law with fewer constants')
     for law in LAWS.values() for x in law.constants if x.place >= 0}
-#: Temperature of an actuator with coefficients, which only feedback estimates.
-TEMPERATURE = 'temperature'
-_ONLY_TRACKED = {TEMPERATURE: Quantity('degrees Celsius', math.nan, 'linear', COLDEST, HOTTEST)}
+#: Temperature of an actuator with coefficients, its change over the measured one, and the thermal
+#: expansion of the length that a sensor measures; and the measured change, in K.
+TEMPERATURE, WARMING, EXPANSION, WARMED = 'temperature', 'warming', 'expansion', 'warmed'
+#: Those that only feedback estimates.
+THERMAL = {
+    TEMPERATURE: Quantity('degrees Celsius', math.nan, 'linear', COLDEST, HOTTEST),
+    WARMING: Quantity('', 1.0, 'linear', -math.inf),
+    EXPANSION: Quantity('1/K', 0.0, 'linear', -math.inf)}
 #: Free by default.
 DEFAULT_FREE = (
     'shear_modulus', 'damping_coefficient', 'chain_limit', 'remanence', 'stretch_bias')
@@ -249,7 +254,7 @@ def quantity_of(name: str) -> Quantity:
 
     Raise `BadInputError` if there is none with this name.
     """
-    found = QUANTITIES.get(name) or _ONLY_TRACKED.get(name) or _OF_LAWS.get(
+    found = QUANTITIES.get(name) or THERMAL.get(name) or _OF_LAWS.get(
         '.'.join(name.split('.')[:2]))
     if found is None:
         raise BadInputError(

@@ -28,7 +28,8 @@ _NOTHING: Array = np.empty(0)
 # Parameters whose derivatives are central differences of the motion, and half their width in
 # coordinates; for moduli, in units of the shear modulus.
 _ASIDE, _WIDTH = ('transverse_mass_factor', 'bulk_ratio'), 1e-3
-_SENSOR = ('stretch_bias', 'stretch_gain', 'sensor_latency')
+_SENSOR = (
+    'stretch_bias', 'stretch_gain', 'sensor_latency', quantities.WARMING, quantities.EXPANSION)
 # Parameters to which values of theta are proportional, by index.
 _LINEAR = {
     'shear_modulus': places.STIFFNESS, 'damping_coefficient': places.DAMPING,
@@ -280,6 +281,12 @@ def respond(
     return Response(values, shown, rate, jacobian, raw[:, inner_count:])
 
 
+def gain_of(values: Mapping[str, float]) -> float:
+    """Return the gain of the sensor for stretch, including thermal expansion."""
+    return values['stretch_gain'] * (1.0 + values.get(quantities.EXPANSION, 0.0) * values.get(
+        quantities.WARMED, 0.0))
+
+
 def sensed(
         values: Mapping[str, float], free: Sequence[str], stretch: Array, rate: Array, by: Array
 ) -> tuple[Array, Array]:
@@ -288,10 +295,11 @@ def sensed(
 
     ``by`` contains those by parameters of the motion; columns of sensor parameters are filled in.
     """
-    gain = values['stretch_gain']
+    gain, warmed = gain_of(values), values.get(quantities.WARMED, 0.0)
     by_sensor: dict[str, float | Array] = {
         'stretch_bias': 1.0, 'stretch_gain': quantities.derivative('stretch_gain', gain) * stretch,
-        'sensor_latency': -gain * rate}
+        'sensor_latency': -gain * rate,
+        quantities.EXPANSION: values['stretch_gain'] * warmed * stretch}
     for j, name in enumerate(free):
         if name in by_sensor:
             by[:, j] = by_sensor[name]

@@ -25,6 +25,8 @@ class Warmth:
     #: The newest measurement: time in ns and temperature; None if there is none.
     measured: tuple[int, float] | None = None
     estimated: bool = False  #: whether it was estimated from the motion since
+    #: Estimated minus measured temperature: coefficients are inexact.
+    offset: float = 0.0
 
     @classmethod
     def of(cls, base: JointModel) -> 'Warmth':
@@ -61,11 +63,15 @@ class Warmth:
             estimated: bool = False) -> 'Warmth':
         """Return it with a temperature that a time in ns has shown, under some levels."""
         foreseen = self.along(levels, time)
+        measured, offset = self.measured if estimated else (time, temperature), self.offset
+        if estimated and measured is not None:
+            offset = temperature - measured[1]
+        elif not estimated:
+            temperature += offset
         # What the warming by the coil does not explain is the temperature without it.
         return replace(
-            foreseen, temperature=temperature, estimated=estimated,
-            measured=foreseen.measured if estimated else (time, temperature),
-            ambient=foreseen.ambient + temperature - foreseen.temperature)
+            foreseen, temperature=temperature, estimated=estimated, measured=measured,
+            offset=offset, ambient=foreseen.ambient + temperature - foreseen.temperature)
 
     def shifted(self, by: int) -> 'Warmth':
         """Return it with its times shifted by some ns."""

@@ -118,7 +118,7 @@ class AdaptiveJoint:
     _setpoint: tuple[int, int] = (0, -1)  # number of the plan, and place under way
     _sensor: tuple[StateEstimate, SensorModel] | None = None  # estimate, and its sensor
     _measured: bool = False  # whether the field is measured
-    _thermometer: tuple[int, float] | None = None  # the newest temperature in use
+    _thermometer: float = field(init=False)  # the newest measured temperature in use
     _differs: int | None = None  # timestamp since which the field differs; None if it does not
     sensor_changed: bool = False  # whether the estimator allows for any bias and gain
     reverts: bool = False  # whether the plan is to be reverted to the given parameters
@@ -128,6 +128,7 @@ class AdaptiveJoint:
     def __post_init__(self, begun: int) -> None:
         given, settings = self.given, self.settings
         self.prior = self._as_identified(given)
+        self._thermometer = self.prior.values[TEMPERATURE]
         place = self.prior.free.index('stretch_bias') if 'stretch_bias' in self.prior.free else -1
         self._bias = self.prior.values['stretch_bias'], math.sqrt(
             self.prior.covariance[place, place]) if place >= 0 else 0.0
@@ -289,9 +290,11 @@ class AdaptiveJoint:
         self.fresh = False
         self._take_levels(max(now, self.newest))
         warmth = self.planner.warmth
-        if warmth is not None and warmth.measured not in (None, self._thermometer):
-            self._thermometer = warmth.measured
-            self.estimator.measured_temperature(warmth.measured[1])
+        if warmth is not None and warmth.measured is not None:
+            stamp, celsius = warmth.measured
+            self.estimator.unmeasured = now - stamp > self.settings.temperature_max_age
+            self.estimator.warmed(celsius - self._thermometer)
+            self._thermometer = celsius
         before = self.estimator.screening.lost
         estimator, found = yield from doing(_updated, self.estimator, now)
         estimator.learning, self.estimator = self.estimator.learning, estimator
@@ -332,14 +335,19 @@ class AdaptiveJoint:
         self.latest, self.news = found, True
         if self.adapts and self.acting is not None:
             self._take_temperature(self.acting.values[TEMPERATURE], now)
+        elif trust.confirmed is None:
+            self.take_measured(now)
+
+    def take_measured(self, now: int) -> None:
+        """Plan for the temperature as measured."""
+        warmth = self.planner.warmth
+        if warmth is not None and warmth.offset:
+            self.planner.take_temperature(warmth.temperature - warmth.offset, now, estimated=True)
 
     def _take_temperature(self, celsius: float, now: int) -> None:
-        """Plan for an estimated temperature, unless there is a newer measurement."""
+        """Plan for an estimated temperature."""
         warmth = self.planner.foreseen(now)
-        if warmth is None or warmth.measured is not None and (
-                now - warmth.measured[0] <= self.settings.temperature_max_age):
-            return
-        if abs(celsius - warmth.temperature) > _WARMER:
+        if warmth is not None and abs(celsius - warmth.temperature) > _WARMER:
             self.planner.take_temperature(celsius, now, estimated=True)
 
     def _restart(self, since: int, *, healthy: bool = False) -> None:
@@ -476,7 +484,7 @@ class AdaptiveJoint:
         """The model of plans without feedback: as given, at the temperature if measured."""
         warmth = self.planner.warmth
         return self.given if warmth is None or warmth.measured is None else (
-            self.given.at_temperature(warmth.temperature))
+            self.given.at_temperature(warmth.measured[1]))
 
     def based(self, model: JointModel) -> JointModel:
         """Return a model of the plan at the reference of the given temperature coefficients."""

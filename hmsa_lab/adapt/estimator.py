@@ -20,6 +20,8 @@ from hmsa.identification.quantities import (
     quantity_of,
     TEMPERATURE,
     values_at,
+    WARMED,
+    WARMING,
 )
 from hmsa.model.creep import Creep
 from hmsa.model.equations import Array
@@ -43,9 +45,9 @@ _NOISE_GAIN = 0.05
 _BOUND, _DRIFT = 4.0, 0.003
 # The same where the temperature is estimated.
 _SLOWER = 0.1 * _DRIFT
-# Drift of the temperature in K in a second, deviation of a measured one, and duration in s at rest
-# in which it counts as constant (benchmarks/warming.py).
-_WARMS, _MEASURED, _CONSTANT = 0.2, 0.3, 1.0
+# Drift of the temperature in K in a second unless it is measured, and in a kelvin of measured
+# change; and duration in s at rest in which it counts as constant (benchmarks/warming.py).
+_WARMS, _BY_KELVIN, _CONSTANT = 0.2, 0.3, 1.0
 # Fraction of this maximum above which an estimate is not trusted, except for uncertain parameters.
 _STRANGE, _FREELY = 0.98, ('damping_coefficient', 'viscoelastic_time')
 # Factor on a variance that keeps a parameter fixed.
@@ -176,6 +178,8 @@ class Estimator:
         # Covariance of the parameters while they are fixed.
         self._fixed: Array | None = None
         self._settled = True  # whether a window may begin at equilibrium
+        self.unmeasured = True  # whether the temperature may change without a measurement
+        self._warmed = 0.0  # change of the measured temperature in K since the window began
         self._levels: list[tuple[int, float]] = []
         self._pending: list[tuple[int, float]] = []
         self._origin = 0
@@ -192,6 +196,7 @@ class Estimator:
         self.screening.restart()
         self._pending.clear()
         self._fixed = self._window = self._solution = None
+        self._warmed = 0.0
 
     @property
     def since(self) -> int:
@@ -315,22 +320,40 @@ class Estimator:
         known, prior = self._fixed, self.prior
         if known is None:
             known = found.covariance[:-2, :-2] + np.diag(self._drift(self._seconds(time)))
+        warming = self._warming(np.eye(len(found.z)))
         values = {x: y for x, y in found.here.values.items() if x != 'behind'}
-        return replace(prior, values=values, covariance=known)
+        if TEMPERATURE in prior.free:
+            values |= values_at(values, prior.free, (warming @ found.z)[:-2])
+            values[WARMED] += self._warmed
+            self._warmed = 0.0
+        warming = warming[:-2, :-2]
+        return replace(prior, values=values, covariance=warming @ known @ warming.T)
 
     def _drift(self, duration: float) -> Array:
         """Return the variance that parameters gain in some seconds, at most their spread's."""
         spread, free = self.prior.spread, self.prior.free
         # A change within minutes is one of the temperature, if that changes parameters.
-        rates = np.where([x == TEMPERATURE for x in free], _WARMS, spread * (
-            _SLOWER if TEMPERATURE in free else _DRIFT))
-        return np.asarray(np.minimum(rates ** 2 * max(duration, 0.0), spread ** 2))
+        gained = (spread * (_SLOWER if TEMPERATURE in free else _DRIFT)) ** 2 * max(duration, 0.0)
+        if TEMPERATURE in free:
+            gained[free.index(TEMPERATURE)] = _BY_KELVIN ** 2 * abs(self._warmed) + (
+                _WARMS ** 2 * max(duration, 0.0) * self.unmeasured)
+        return np.asarray(np.minimum(gained, spread ** 2))
 
-    def measured_temperature(self, celsius: float) -> None:
-        """Take a measured temperature of the block into account."""
-        if self._window is not None and TEMPERATURE in self.prior.free:
-            self._window.observe(
-                self.prior.free.index(TEMPERATURE), celsius, _MEASURED ** 2)
+    def warmed(self, by: float) -> None:
+        """Take a change of the measured temperature of the block in K into account."""
+        if TEMPERATURE in self.prior.free:
+            self._warmed += by
+
+    def _warming(self, follows: Array) -> Array:
+        """
+        Return how coordinates have changed with the measured temperature since the window began.
+
+        ``follows`` is the derivative of all coordinates by each one.
+        """
+        change, free = np.eye(len(follows)), self.prior.free
+        if self._warmed:
+            change[:, free.index(WARMING)] += self._warmed * follows[:, free.index(TEMPERATURE)]
+        return change
 
     def _new_window(self, stamp: int, shown: float, prior: Prior | None = None) -> Window:
         """Return a window at the equilibrium of the present level, else at the reading."""
@@ -455,14 +478,20 @@ class Estimator:
         drift[-2:] = _AT_REST ** 2, (_AT_REST / here.values['time_unit']) ** 2
         if self._fixed is None:
             drift[:-2] = self._drift(time - window.begin)
-        wander = self._with_rest(np.diag(drift), here.values, time)
+        follows = self._with_rest(here.values, time)
+        wander, warming = follows @ np.diag(drift) @ follows.T, self._warming(follows)
         shift = round(time * NANOSECONDS)
         seconds = shift / NANOSECONDS
         # Later motion shows how equilibrium depends on parameters.
         at = window.rest if self.learning is (self._fixed is None) and self._unchanged(
-            self._origin, self._origin + shift, 0.0) else None
-        moved = window.move_on(place, time, found.z, here, self.noise, wander) if at is None else (
+            self._origin, self._origin + shift, 0.0) and not self._warmed else None
+        moved = window.move_on(
+            place, time, found.z, here, self.noise, wander, warming) if at is None else (
             window.rest_on(at, place, time, here, self.noise, wander))
+        if self._warmed:
+            moved.values = {**moved.values, WARMED: moved.values[WARMED] + self._warmed}
+            here = here._replace(values={**here.values, WARMED: moved.values[WARMED]})
+            self._warmed = 0.0
         self._fix(moved, found)
         if here.motion.behind:
             until_then = self._follow(found, window, time)
@@ -473,7 +502,7 @@ class Estimator:
         moved.time = moved.time - seconds
         self._origin += shift
         self._window = moved
-        self._solution = replace(found, z=np.append(
+        self._solution = replace(found, z=warming @ np.append(
             found.z[:-2], [here.motion.stretch[place], here.motion.rate[place]]),
             here=here, covariance=moved.covariance if at is None else found.covariance,
             off=np.zeros_like(found.off), instead=np.zeros_like(found.off),
@@ -490,17 +519,16 @@ class Estimator:
         return until - begun > _CONSTANT and all(
             self._seconds(x) < until - calm for x in self._moves(until))
 
-    def _with_rest(self, drift: Array, values: Mapping[str, Any], time: float) -> Array:
-        """Return a drift where the equilibrium at a time in s follows the temperature."""
-        if TEMPERATURE not in self.prior.free:
-            return drift
-        level = self._level(self._origin + round(time * NANOSECONDS))
-        at = rest(values, self.prior.free, level)
-        if at is None:
-            return drift
-        place, follows = self.prior.free.index(TEMPERATURE), np.eye(len(drift))
-        follows[-2, place] = at[2][place]
-        return np.asarray(follows @ drift @ follows.T)
+    def _with_rest(self, values: Mapping[str, Any], time: float) -> Array:
+        """Return the derivative of coordinates by each one, where rest follows temperature."""
+        follows = np.eye(len(self.prior.free) + 2)
+        if TEMPERATURE in self.prior.free:
+            level = self._level(self._origin + round(time * NANOSECONDS))
+            at = rest(values, self.prior.free, level)
+            if at is not None:
+                place = self.prior.free.index(TEMPERATURE)
+                follows[-2, place] = at[2][place]
+        return follows
 
     def _level(self, stamp: int) -> float:
         """Return the level in T at a timestamp in ns."""

@@ -85,6 +85,7 @@ class Feedback(Follower):
         for joint in self.joints.values():
             # Without an estimate, corrections that are being drafted have no result.
             joint.latest = None
+            joint.take_measured(self._clock())
         self.joints = {
             name: AdaptiveJoint(
                 name, self._group.planners[name], model, self._settings, self._clock())

@@ -16,7 +16,7 @@ from hmsa.identification.quantities import (
     derivative,
     Known,
     quantity_of,
-    TEMPERATURE,
+    THERMAL,
     values_of,
 )
 from hmsa.interfaces.actuator import parameters_of
@@ -152,7 +152,7 @@ def known_of(estimate: StateEstimate) -> Known:
     """Return the uncertainty of the parameters of an estimate."""
     # A suspected parameter that is not in use has no standard deviation.
     places = [i for i, x in enumerate(estimate.free)
-              if estimate.deviations[x] > 0.0 and i != estimate.gain and x != TEMPERATURE]
+              if estimate.deviations[x] > 0.0 and i != estimate.gain and x not in THERMAL]
     names = tuple(estimate.free[i] for i in places)
     values = tuple(estimate.values[x] for x in names)
     scale = np.array([derivative(x, y) for x, y in zip(names, values, strict=True)])

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from hmsa.identification.quantities import modulus_of, TEMPERATURE
+from hmsa.identification.quantities import modulus_of, THERMAL
 from hmsa_lab.adapt.estimator import StateEstimate
 from hmsa_lab.adapt.motion import held
 
@@ -58,7 +58,7 @@ def differences(estimate: StateEstimate, nominal: Mapping[str, Any]) -> list[str
     found = []
     hidden = _PAIR if confounded(estimate) else ()
     for name in estimate.free:
-        if name in hidden or name in ('viscoelastic_time', TEMPERATURE):
+        if name in hidden or name in ('viscoelastic_time', *THERMAL):
             continue
         value, before = estimate.values[name], nominal[name]
         change = value - before

@@ -13,10 +13,14 @@ from hmsa.identification.quantities import (
     complete,
     coordinates,
     derivative,
+    EXPANSION,
     Known,
     QUANTITIES,
     TEMPERATURE,
+    THERMAL,
     values_of,
+    WARMED,
+    WARMING,
 )
 from hmsa.model.equations import Array
 from hmsa.model.laws.coordinate import Coordinate, coordinate_of
@@ -55,9 +59,12 @@ _ALIKE = {'stretch_bias': 2e-4, 'stretch_gain': 1e-3}
 # Deviation of a bias that alone has changed, and part of it up to which one is known before.
 _JUMPED, _KNOWN = 0.05, 0.3
 _HIDDEN = ('remanence', 'chain_limit', 'constant_force')
+# Deviations of the change of the temperature over the measured one, as coefficients are inexact,
+# and of the thermal expansion in 1/K: that of a silicone (benchmarks/warming.py).
+_INEXACT = {WARMING: 0.2, EXPANSION: 3e-4}
 # Deviation in K of the temperature that is given, and the largest for its range, which leaves this
 # fraction of each parameter.
-_GIVEN, _WIDEST, _LEAST_FACTOR = 1.0, 20.0, 0.2
+_GIVEN, _WIDEST, _LEAST_FACTOR = 0.1, 20.0, 0.2
 # Relaxation time of a suspected branch in time scales.
 _RELAXATION = 2.0
 
@@ -131,7 +138,8 @@ class Prior:
         size, given = [], deviations or {}
         thermal = actuator.thermal
         steepest = max(abs(getattr(thermal, x)) for x in BLOCK_COEFFICIENTS)
-        values |= {'thermal': thermal, TEMPERATURE: thermal.ambient}
+        values |= {'thermal': thermal, TEMPERATURE: thermal.ambient, WARMED: 0.0} | {
+            x: THERMAL[x].default for x in _INEXACT}
         for name in free:
             deviation = given.get(name, DEVIATIONS[name])
             if name == 'constant_force' and name not in given:
@@ -146,12 +154,12 @@ class Prior:
             size.append(deviation)
         spread = size.copy()
         if steepest:
-            free = (*free, TEMPERATURE)
-            size.append(_GIVEN)
-            spread.append(min(_WIDEST, 0.25 * (1.0 - _LEAST_FACTOR) / steepest))
+            free = (*free, TEMPERATURE, *_INEXACT)
+            size += [_GIVEN, *_INEXACT.values()]
+            spread += [min(_WIDEST, 0.25 * (1.0 - _LEAST_FACTOR) / steepest), *_INEXACT.values()]
         return cls(
             values, free, np.diag(np.square(size)), np.array(spread), tuple(
-                i for i, x in enumerate(free) if x != TEMPERATURE and (
+                i for i, x in enumerate(free) if x not in THERMAL and (
                     i >= named or x in _AS_GIVEN)) if suspects else (), named)
 
     @classmethod

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from hmsa.identification.fit import loss, weights_of
 from hmsa.identification.quantities import complete, quantity_of, TEMPERATURE, values_at
-from hmsa.identification.response import sensed
+from hmsa.identification.response import gain_of, sensed
 from hmsa.model.equations import Array
 from hmsa.model.laws.coordinate import coordinate_of
 from hmsa_lab.adapt.hypotheses import Evidence, GAIN, Hypotheses, inverse, optimum, Others
@@ -128,14 +128,6 @@ class Rest(NamedTuple):
     weight: float = 0.0  # information in the reading
 
 
-def _observed(
-        mean: Array, covariance: Array, place: int, value: float, variance: float
-) -> tuple[Array, Array]:
-    """Return mean and covariance with an observation of one coordinate."""
-    pull = covariance[place] / (covariance[place, place] + variance)
-    return mean + pull * (value - mean[place]), covariance - np.outer(pull, covariance[place])
-
-
 @dataclass(eq=False)
 class Window:
     """Samples and prior of the horizon; times in s from a common origin."""
@@ -192,23 +184,13 @@ class Window:
         self.covariance[[-2, -1], [-2, -1]] += np.square([off, off * at[1]])
         if known.weight > 0.0:
             state = np.zeros((1, len(z)))
-            state[0, -2] = values['stretch_gain']
+            state[0, -2] = gain_of(values)
             shown, by_all = sensed(values, self.free, np.array([at[0]]), np.zeros(1), state)
             by = self._about_rest(values, by_all)[0]
             pull = self.covariance @ by
             share = pull / (by @ pull + 1.0 / known.weight)
             self.mean += share * (known.shown - float(shown[0]) - by @ (self.mean - there))
             self.covariance -= np.outer(share, pull)
-
-    def observe(self, place: int, value: float, variance: float) -> None:
-        """Add an observation of a parameter, by its index, to the prior."""
-        if self.rest is None:
-            self.mean, self.covariance = _observed(
-                self.mean, self.covariance, place, value, variance)
-        else:
-            mean, covariance = _observed(
-                self.rest.mean, self.rest.covariance, place, value, variance)
-            self.rest = self.rest._replace(mean=mean, covariance=covariance)
 
     def rest_on(
             self, at: Rest, count: int, begin: float, here: Simulation, noise: float,
@@ -422,7 +404,7 @@ class Window:
             return None
         n = len(self.stretch)
         shown, by = sensed(
-            values, self.free, motion.stretch, motion.rate, values['stretch_gain'] * motion.by)
+            values, self.free, motion.stretch, motion.rate, gain_of(values) * motion.by)
         residual: Array = self.stretch - shown[:n]
         apart = z - self.mean
         cost = loss(residual, noise, convex=True) + 0.5 * float(
@@ -440,21 +422,21 @@ class Window:
 
     def move_on(
             self, count: int, begin: float, z: Array, here: Simulation, noise: float,
-            drift: Array) -> 'Window':
+            drift: Array, warming: Array) -> 'Window':
         """
         Return the window without the first samples, which become part of the prior.
 
-        It begins at the next sample, or at the requested time. The drift is the covariance that
-        parameters and state gain in between, shape (q, q).
+        It begins at the next sample, or at the requested time. In between, coordinates change by
+        the matrix ``warming``, and gain the covariance ``drift``, both of shape (q, q).
         """
         by, weights = here.by[:count], here.weights[:count]
         matrix = self.information + by.T @ (weights[:, None] * by) / noise ** 2
         gradient = by.T @ (weights * here.residual[:count]) / noise ** 2
         gradient = gradient + self.information @ (self.mean - z)
         covariance = inverse(matrix, np.ones(len(z), dtype=np.bool_))
-        change = transport(here.motion, count)
+        change = warming @ transport(here.motion, count)
         there = np.append(z[:-2], [here.motion.stretch[count], here.motion.rate[count]])
-        there = there + change @ (covariance @ gradient)
+        there = warming @ there + change @ (covariance @ gradient)
         covariance = change @ covariance @ change.T + drift
         return Window(
             self.values, self.free, there,
