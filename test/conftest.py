@@ -116,8 +116,8 @@ def pytest_runtest_makereport(
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
-    """Return two workers for each core, since a test with nodes mostly waits for them."""
-    return 2 * (os.cpu_count() or 1)
+    """Return five workers for two cores, since a test with nodes mostly waits for them."""
+    return 5 * (os.cpu_count() or 1) // 2
 
 
 @pytest.hookimpl(wrapper=True)
