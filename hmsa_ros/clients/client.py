@@ -416,7 +416,7 @@ def unheard(node: Node, namespace: str, joints: Sequence[str]) -> list[str]:
 
 def _commands(node: Node, namespace: str, joints: Sequence[str]) -> list[str]:
     """Return the topics on which the planner commands joints, including remapped ones."""
-    planner = f'/{namespace.strip("/")}/{topics.PLANNER}'.replace('//', '/')
+    planner = ros_entities.full_name(topics.PLANNER, namespace)
     named = [
         topic for topic, types in node.get_topic_names_and_types()
         if topics.FLUX_DENSITY_COMMAND.type in types

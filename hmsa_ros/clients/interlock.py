@@ -27,7 +27,7 @@ class InterlockLink(TemporaryNode):
 
     def __init__(self, driver: str, namespace: str, timeout: float) -> None:
         super().__init__('interlock', namespace, timeout)
-        self._driver = f'/{namespace.strip("/")}/{driver}'.replace('//', '/')
+        self._driver = ros_entities.full_name(driver, namespace)
         self._publisher = ros_entities.publisher(self.node, topics.INTERLOCK, driver)
         self._reports = ros_entities.listen(self.node, topics.DIAGNOSTICS)
         #: Last statuses of the driver, by what they are about.

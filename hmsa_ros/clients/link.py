@@ -53,7 +53,7 @@ class Link(TemporaryNode):
     def __init__(self, namespace: str = '', timeout: float = 10.0) -> None:
         super().__init__('client', namespace, timeout)
         self._namespace = namespace
-        self._planner = f'/{namespace.strip("/")}/{topics.PLANNER}'.replace('//', '/')
+        self._planner = ros_entities.full_name(topics.PLANNER, namespace)
         #: Last verdict of the planner.
         self.verdict: StatusVerdict = SILENCE
         ros_entities.subscribe(self.node, topics.STATUS, self._on_status, topics.PLANNER)

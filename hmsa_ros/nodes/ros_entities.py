@@ -65,6 +65,11 @@ def profile(quality: Quality) -> QoSProfile:
         else DurabilityPolicy.VOLATILE)
 
 
+def full_name(name: str, namespace: str) -> str:
+    """Return the full name of a node."""
+    return f'/{namespace.strip("/")}/{name}'.replace('//', '/')
+
+
 def publishers_of(node: Node, topic: str) -> dict[bytes, str]:
     """
     Return the publishers of a topic in the graph: full node names by identifier.
@@ -129,8 +134,9 @@ def matched(node: Node, publisher: Publisher, *owners: str) -> bool:
 
 
 def _names(endpoints: Iterable[Any]) -> dict[bytes, str]:
-    return {bytes(x.endpoint_gid): '' if x.node_name == _UNKNOWN else (
-        f'{x.node_namespace.rstrip("/")}/{x.node_name}') for x in endpoints}
+    return {
+        bytes(x.endpoint_gid): '' if x.node_name == _UNKNOWN else full_name(
+            x.node_name, x.node_namespace) for x in endpoints}
 
 
 def publisher(node: Node, topic: Topic, owner: str = '') -> Publisher:
