@@ -276,6 +276,25 @@ def test_a_long_operation_says_what_is_under_way_and_how_long_where_no_bar_is_sh
         'starting ...', 'working (1 of 2) ...', 'closing ...']
 
 
+def test_an_operation_that_begins_is_said_once_without_a_time(capsys, wait_until, monkeypatch):
+    monkeypatch.setattr(terminal, 'PATIENCE', 0.005)
+    said = []
+
+    class Activities(list):
+        def append(self, activity):
+            super().append(activity)
+            teller._thread.join(0.05)  # which speaks meanwhile if it can
+
+    with terminal.under_way('outside'):
+        teller, = terminal._tellers
+        teller.activities = Activities(teller.activities)
+        with terminal.under_way('inside'):
+            wait_until(lambda: said.append(capsys.readouterr().err) or 'inside' in said[-1])
+    inside = [x for x in ''.join(said).splitlines() if x.startswith('inside')]
+    assert inside[0] == 'inside ...'
+    assert inside.count('inside ...') == 1
+
+
 @pytest.mark.parametrize('name', sorted({*registered(COMMANDS)} - {*registered(NODES)}))
 def test_a_command_says_what_it_does_from_its_start_on(name, capsys, wait_until, monkeypatch):
     words = [name, *{'param': ['get', 'planner'], 'bag': ['info', 'run'],

@@ -53,6 +53,8 @@ class _Teller:
     def __init__(self) -> None:
         self.activities: list[_Activity] = []  # each within the one before
         self._spoken, self._begun = time.monotonic(), False
+        # The thread must not say an activity that its beginning is about to say.
+        self._lock = threading.Lock()
         self._done = threading.Event()
         self._thread = threading.Thread(target=self._wait, daemon=True)
 
@@ -65,19 +67,23 @@ class _Teller:
         self._done.set()
         self._thread.join()
 
+    def begin(self, activity: _Activity) -> None:
+        """Begin an activity within the others; say it if others were said."""
+        with self._lock:
+            self.activities.append(activity)
+            if self._begun:
+                self._say()
+
     def change(self, activity: _Activity, words: str) -> None:
         """Change the words of an activity."""
         # Figures in parentheses change all the time.
         new = words.partition(' (')[0] != activity.words.partition(' (')[0]
-        activity.words = words
-        if new:
-            activity.since = time.monotonic()
-            self.tell_change()
-
-    def tell_change(self) -> None:
-        """Say the innermost activity, which is new, if others were said."""
-        if self._begun:
-            self._say()
+        with self._lock:
+            activity.words = words
+            if new:
+                activity.since = time.monotonic()
+                if self._begun:
+                    self._say()
 
     def _say(self, after: str = '') -> None:
         self._spoken = time.monotonic()
@@ -88,13 +94,16 @@ class _Teller:
 
     def _wait(self) -> None:
         while True:
-            lasted = time.monotonic() - self.activities[-1].since
-            due = self._spoken + max(PATIENCE, _SHARE * lasted)
-            if self._done.wait(max(due - time.monotonic(), 0.0)):
+            if self._done.wait(max(self._due() - time.monotonic(), 0.0)):
                 return
-            if time.monotonic() >= due:
-                since = self.activities[-1].since
-                self._say(f', {time.monotonic() - since:.0f} s' if self._begun else '')
+            with self._lock:
+                if time.monotonic() >= self._due():
+                    since = self.activities[-1].since
+                    self._say(f', {time.monotonic() - since:.0f} s' if self._begun else '')
+
+    def _due(self) -> float:
+        lasted = time.monotonic() - self.activities[-1].since
+        return self._spoken + max(PATIENCE, _SHARE * lasted)
 
 
 _tellers: list[_Teller] = []
@@ -112,11 +121,9 @@ def under_way(words: str = '') -> Iterator[Callable[[str], None]]:
     if own:
         _tellers.append(_Teller())
     teller, activity = _tellers[0], _Activity(words)
-    teller.activities.append(activity)
+    teller.begin(activity)
     if own:
         teller.start()
-    else:
-        teller.tell_change()
     try:
         yield partial(teller.change, activity)
     finally:
