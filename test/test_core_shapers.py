@@ -228,6 +228,9 @@ def test_too_little_room_for_the_grid_or_the_ramps_is_refused_with_what_is_neede
     with pytest.raises(RefusedError, match='expected no slew limit'):
         get_shaper('two_step')(replace(slow, delivery=Delivery(slew=1e-4)))
     with pytest.raises(RefusedError, match='needs a flux density of'):
+        get_shaper('minimum_time')(MoveRequest(
+            State(1.0), 1.4, PAPER, Limits(-0.1, 0.5), Delivery(slew=1e-307, resolution=1e-6)))
+    with pytest.raises(RefusedError, match='needs a flux density of'):
         get_shaper('zvd')(MoveRequest(State(1.0), 1.4, PAPER, Limits(-0.1, 0.5)))
     holding = get_shaper('step')(MoveRequest(State(1.0), 1.1, PAPER)).levels[-1].load
     assert get_shaper('minimum_time')(

@@ -50,8 +50,8 @@ class Delivery:
         return _SETTLED * self.lag
 
     def rounded(self, time: float) -> float:
-        """Return a time, possibly infinite, rounded to a multiple of the resolution."""
-        if self.resolution == 0.0 or math.isinf(time):
+        """Return a time, possibly infinite or huge, rounded to a multiple of the resolution."""
+        if self.resolution == 0.0 or math.isinf(time / self.resolution):
             return time
         return round(time / self.resolution) * self.resolution
 
