@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
+from hmsa.api.actuator import Actuator
 from hmsa.cli import main
 from hmsa.errors import BadInputError
 from hmsa.interfaces.quantities import BY_KEY, DAMPING, OPTIONAL, QUANTITIES, quantity_of
@@ -132,6 +133,13 @@ def test_the_file_has_what_was_given_in_si_units(run, tmp_path):
         assert f'#   {line.strip()}' in (tmp_path / 'my own.yaml').read_text()
 
 
+def test_a_block_takes_the_damping_ratio_of_its_ringing(run, tmp_path):
+    own = [*OWN[:OWN.index('--zeta')], *OWN[OWN.index('--zeta') + 2:]]
+    status, out, err = run(*own, '--damping-ratio', '0.04')
+    assert (status, err) == (0, '')
+    assert Actuator.from_yaml(tmp_path / 'actuator.yaml').damping_ratio == pytest.approx(0.04)
+
+
 def test_a_law_without_limiting_stretches_shows_none(run):
     assert 'limiting stretches' in run('--yes', '--out', 'gent.yaml')[1]
     for law in ('neo_hookean', 'yeoh:c10=5kPa'):
@@ -248,6 +256,9 @@ def test_a_file_that_exists_is_kept_unless_forced(run, tmp_path):
     (['--remanence', '1e999'], 'remanence is inf T'),
     (['--j-lim', '5 Pa'], "unit 'Pa': expected a number without a unit"),
     (['--zeta', '1', '--damping', '1'], 'both --zeta and --damping'),
+    (['--zeta', '1', '--damping-ratio', '0.4'], 'both --zeta and --damping-ratio'),
+    (['--beam', '--damping-ratio', '0.1', '--damping', '1'], 'both --damping-ratio and --damping'),
+    (['--beam', '--zeta', '1'], '--zeta is given: expected sizes of a beam'),
     (['--flux-min', '0.5'], 'expected the minimum below the maximum'),
     (['--joint', '1st'], "joint '1st': expected letters"),
     (['--joint', 'a__b'], "joint 'a__b'"),

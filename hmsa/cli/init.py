@@ -54,8 +54,8 @@ _COIL = ('flux_max', 'flux_min', 'slew_limit')
 # Forms with their own sizes and constants.
 _OF_THEIR_OWN = ('beam',)
 _ARGUMENTS = {'j_lim': 'chain_limit', 'damping': 'damping_coefficient'}
-# The damping coefficient may be given instead of these.
-_DAMPED = ('zeta', 'damping_ratio')
+# One of these is given; a block has the first one, a beam the second one by default.
+_DAMPED = ('zeta', 'damping_ratio', DAMPING.key)
 _FILE = Path('actuator.yaml')
 _FOLLOWS = {'half_thickness': 'as --half-length', 'flux_min': 'minus --flux-max'}
 # Full sizes, of a beam or a block, and the quantities of a block whose doubles they are.
@@ -89,12 +89,14 @@ def add_parser(subparsers: Any) -> None:
 
 def _option(quantity: GivenNumber) -> Row:
     """Return the option of a quantity."""
-    note = ', in place of --zeta; with --beam of its tip, in place of --damping-ratio'
+    note = ', in place of --zeta or --damping-ratio; with --beam of its tip'
     if quantity is not DAMPING:
         note = f' (default {_FOLLOWS.get(quantity.key) or format(quantity.default, "g")})'
         if quantity not in QUANTITIES:
             note += ', with ' + ' or '.join(
                 f'--{x}' for x in _OF_THEIR_OWN if quantity.key in {y.key for y in FORMS[x]})
+        if quantity.key == 'damping_ratio':
+            note += '; of a block, in place of --zeta'
         if quantity.key in _FULL:
             note += f'; of a block, twice --{_FULL[quantity.key].replace("_", "-")}'
     unit = f' [{quantity.unit}]' if quantity.unit else ''
@@ -179,17 +181,17 @@ def _given(
                 f'both --{full} and --{half.replace("_", "-")} are given: expected one of them')
         if full in given:
             given[half] = 0.5 * given.pop(full)
-    for key in _DAMPED:
-        if key in given and DAMPING.key in given:
-            raise BadInputError(
-                f'both --{key.replace("_", "-")} and --damping are given: expected one of them')
+    damped = [f'--{x.replace("_", "-")}' for x in _DAMPED if x in given]
+    if len(damped) > 1:
+        raise BadInputError(f'both {" and ".join(damped[:2])} are given: expected one of them')
     if form == 'beam' and 'shear_modulus' in given:
         if 'youngs_modulus' in given:
             raise BadInputError(
                 'both --shear-modulus and --youngs-modulus are given: expected one of them, '
                 'since E is 3 G')
         given['youngs_modulus'] = 3.0 * given.pop('shear_modulus')
-    if others := given.keys() - {x.key for x in wanted} - {DAMPING.key}:
+    # zeta is of a block only.
+    if others := given.keys() - {x.key for x in wanted} - {*_DAMPED[1:]}:
         own = [x for x in _OF_THEIR_OWN if others <= {y.key for y in FORMS[x]}]
         raise BadInputError(
             f'{", ".join(sorted("--" + x.replace("_", "-") for x in others))} is given: expected '
@@ -201,8 +203,8 @@ def _given(
 
 
 def _known(key: str, given: Mapping[str, float]) -> bool:
-    """Return whether a value is given, or the damping coefficient instead."""
-    return key in given or (key in _DAMPED and DAMPING.key in given)
+    """Return whether a value is given, or another one of damping instead."""
+    return key in given or (key in _DAMPED and any(x in given for x in _DAMPED))
 
 
 def _actuator(
@@ -211,11 +213,9 @@ def _actuator(
     from hmsa.api.actuator import Actuator
     from hmsa.api.facts import unquestioned
 
-    # Only the one that is given.
-    damping = (DAMPING.key,) if DAMPING.key in given else _DAMPED
     values: dict[str, Any] = {
         _ARGUMENTS.get(x, x): given[x]
-        for x in (*(y.key for y in FORMS[form] if y.key not in (*_COIL, *_DAMPED)), *damping)
+        for x in (*(y.key for y in FORMS[form] if y.key not in (*_COIL, *_DAMPED)), *_DAMPED)
         if x in given}
     if mount != MOUNTS[0]:
         values['mount'] = mount
