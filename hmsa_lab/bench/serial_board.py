@@ -238,6 +238,8 @@ class SimulatedBoard(SimulatedLine):
     ----------
     truth : str
         CSV file for the true motion; empty for none.
+    clock : callable
+        Returns the host time in ns.
 
     Raises
     ------
@@ -251,9 +253,10 @@ class SimulatedBoard(SimulatedLine):
     #: temperature of the coil in degrees Celsius; NaN if not measured
     temperature = math.nan
 
-    def __init__(self, truth: str = '') -> None:
+    def __init__(self, truth: str = '', clock: Callable[[], int] = monotonic_ns) -> None:
         super().__init__()
-        self._begun = monotonic_ns()
+        self._clock = clock
+        self._begun = clock()
         self._block = self._make_block()
         self._random = Random(1)
         self._level = 0
@@ -275,7 +278,7 @@ class SimulatedBoard(SimulatedLine):
     def restart(self) -> None:
         """Boot: the coil is off, and the clock starts at 0."""
         self._board = _board.make(_LIMIT, _RESOLUTION)
-        self._booted = monotonic_ns()
+        self._booted = self._clock()
         self._next_sample = self._now = 0
 
     def _host(self, time: int) -> int:
@@ -284,7 +287,7 @@ class SimulatedBoard(SimulatedLine):
 
     def advance(self) -> int:
         """Do the work due by now; return the board time in us."""
-        now = math.floor((monotonic_ns() - self._booted) * (1.0 + self.fast) / 1000)
+        now = math.floor((self._clock() - self._booted) * (1.0 + self.fast) / 1000)
         while True:
             due = _board.due(self._board)
             # A late level is applied on arrival.
