@@ -24,6 +24,8 @@ from typing import Any, ClassVar
 from extras import has, needs
 from forks import Forked, ForkServer
 from hypothesis import HealthCheck, Phase, settings
+from hypothesis.internal.conjecture import providers
+from hypothesis.internal.constants_ast import Constants
 import pytest
 
 from hmsa.cli import terminal
@@ -93,7 +95,12 @@ def pytest_configure(config: pytest.Config) -> None:
             deadline=None, suppress_health_check=[HealthCheck.too_slow],
             # Explaining an example traces the lines of Python: integrations then take minutes.
             phases=[x for x in Phase if x is not Phase.explain])
-    settings.load_profile(config.getoption('--hypothesis-profile') or 'gate')
+    profile = config.getoption('--hypothesis-profile') or 'gate'
+    settings.load_profile(profile)
+    if profile == 'gate':
+        # Nor do its examples depend on constants in the modules that a worker happens to have
+        # imported, which each of them would parse.
+        providers._get_local_constants = Constants
 
 
 def pytest_report_header() -> str | None:
