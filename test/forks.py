@@ -28,6 +28,8 @@ COMMANDS = (*registered(NODES), 'send', 'stop', 'interlock', 'param', 'watch')
 SAFE = fast_dds() == 2
 # Variables that a process reads while it starts and imports: with others it is no fork.
 EARLY = ('PYTHON', 'LC_', 'LANG', 'LD_', 'OMP_')
+# A fork can look for modules in further places.
+PATH = 'PYTHONPATH'
 
 
 class Forked:
@@ -89,7 +91,7 @@ class ForkServer:
         """Return whether a process with arguments and an environment may be a fork."""
         if not arguments or arguments[0] not in COMMANDS or not SAFE:
             return False
-        names = {x for x in {*env, *self._env} if x.startswith(EARLY)}
+        names = {x for x in {*env, *self._env} if x.startswith(EARLY)} - {PATH}
         return all(env.get(x) == self._env.get(x) for x in names)
 
     def start(
@@ -113,7 +115,8 @@ def become(
     os.environ.clear()
     os.environ.update(env)
     os.chdir(folder)
-    sys.path[0] = folder
+    further = env.get(PATH, '').split(os.pathsep)
+    sys.path[:1] = [folder, *(x for x in further if x and x not in sys.path)]
     sys.argv[1:] = arguments
     for number, (path, flags) in enumerate((
             (os.devnull, os.O_RDONLY), (stdout, os.O_WRONLY), (stderr, os.O_WRONLY))):
