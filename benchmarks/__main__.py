@@ -32,6 +32,7 @@ A page is a Markdown file; a table replaces the text between its marks ``<!-- be
 import argparse
 import importlib
 import importlib.util
+import inspect
 import json
 from pathlib import Path
 import sys
@@ -39,18 +40,38 @@ from typing import Any
 
 from rich.console import Console
 
-from benchmarks.measure import machine, Report
+from benchmarks.measure import machine
 from benchmarks.sheet import Sheet
 
 # Of a table that is written to a file.
 _WIDTH = 120
 
-NAMES = ('judge', 'planner', 'plant', 'preemption', 'joints', 'controller', 'recorder', 'player',
-         'crash')
-#: Only run on request: they take long and need the machine for themselves.
-LONG = ('faults', 'soak', 'feedback', 'identification', 'defects', 'harm', 'laboratory',
-        'line', 'studies', 'rates', 'lockstep', 'continuum', 'compressible', 'predictions',
-        'repeats', 'beam', 'beam-identification', 'modes')
+#: Benchmarks, each with the functions that make its tables, as MODULE.FUNCTION of bench_MODULE,
+#: which take some of the options.
+TABLES = {
+    'judge': ('judge.compare',),
+    'planner': ('planner.compare', 'planner.choices', 'planner.start_up'),
+    'plant': ('plant.compare',), 'preemption': ('preemption.compare',),
+    'joints': ('joints.compare',), 'controller': ('controller.compare',),
+    'recorder': ('recorder.compare',), 'player': ('player.compare',), 'crash': ('crash.compare',)}
+NAMES = tuple(TABLES)
+#: The others run on request only: they take long and need the machine for themselves.
+TABLES |= {
+    'feedback': ('feedback.compare',),
+    'identification': (
+        'identification.speed', 'identification.robustness', 'identification.compare'),
+    'defects': ('defects.compare',), 'harm': ('harm.compare',),
+    'laboratory': ('laboratory.compare',), 'line': ('line.compare',),
+    'studies': ('studies.compare',), 'rates': ('studies.rates',),
+    'lockstep': ('studies.lockstep',),
+    'continuum': ('continuum.compare', 'continuum.little_damped'),
+    'compressible': ('compressible.compare',), 'predictions': ('continuum.predicted',),
+    'repeats': ('repeats.compare',), 'beam': ('beam.compare', 'beam.sequences'),
+    'beam-identification': ('beam.identified',),
+    'modes': ('continuum.covered', 'continuum.identified')}
+LONG = ('faults', 'soak', *list(TABLES)[len(NAMES):])
+_NEED_ROS = ('preemption', 'joints', 'controller', 'recorder', 'player', 'crash', 'feedback',
+             'faults', 'soak')
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -103,123 +124,32 @@ def main(arguments: list[str] | None = None) -> int:
     console.print(where)
     if host['load_average'] > 0.5:
         console.print('Other processes are running: trust the ratios, least times above all.')
-    reports: list[Report | Sheet] = []
-    remarks: list[str] = []
+    sheets: list[Sheet] = []
     record: dict[str, Any] = {'machine': host}
     status = 0
-
-    def add(report: Report | Sheet) -> None:
-        nonlocal status
-        report.show(console)
-        reports.append(report)
-        record[report.key] = report.record()
-        if isinstance(report, Sheet) and not report.passed:
-            console.print(f'{report.key}: not what is promised')
+    given = {'quick': options.quick, 'minutes': options.minutes, 'picture': options.picture,
+             **({'runs': options.runs} if options.runs else {})}
+    names = [x for x in names if x not in _NEED_ROS or _has_ros(x)]
+    for path in (y for x in TABLES if x in names for y in TABLES[x]):
+        module, _, function = path.partition('.')
+        make = getattr(importlib.import_module(f'benchmarks.bench_{module}'), function)
+        takes = inspect.signature(make).parameters
+        sheet: Sheet = make(**{x: y for x, y in given.items() if x in takes})
+        sheet.show(console)
+        sheets.append(sheet)
+        record[sheet.key] = sheet.record()
+        if not sheet.passed:
+            console.print(f'{sheet.key}: not what is promised')
             status = 1
-
-    if 'judge' in names:
-        from benchmarks import bench_judge
-
-        add(bench_judge.compare(quick=options.quick, runs=options.runs or bench_judge.RUNS))
-    if 'planner' in names:
-        from benchmarks import bench_planner
-
-        add(bench_planner.compare(quick=options.quick))
-        for line in bench_planner.summary(reports[-1]):
-            console.print(line)
-            remarks.append(line)
-        add(bench_planner.choices(quick=options.quick))
-        add(bench_planner.start_up(quick=options.quick))
-    if 'plant' in names:
-        from benchmarks import bench_plant
-
-        add(bench_plant.compare(quick=options.quick))
-    if 'preemption' in names and _has_ros('preemption'):
-        from benchmarks import bench_preemption
-
-        add(bench_preemption.compare(quick=options.quick))
-    if 'identification' in names:
-        from benchmarks import bench_identification
-
-        add(bench_identification.speed(quick=options.quick))
-        runs = options.runs or bench_identification.RUNS
-        add(bench_identification.robustness(
-            quick=options.quick, runs=min(runs, bench_identification.ROBUST_RUNS)))
-        add(bench_identification.compare(quick=options.quick, runs=runs))
-    if 'defects' in names:
-        from benchmarks import bench_defects
-
-        add(bench_defects.compare(
-            quick=options.quick, runs=options.runs or bench_defects.RUNS))
-    if 'harm' in names:
-        from benchmarks import bench_harm
-
-        add(bench_harm.compare(
-            quick=options.quick, runs=options.runs or bench_harm.RUNS, picture=options.picture))
-    if 'laboratory' in names:
-        from benchmarks import bench_laboratory
-
-        add(bench_laboratory.compare(
-            quick=options.quick, runs=options.runs or bench_laboratory.RUNS))
-    if 'line' in names:
-        from benchmarks import bench_line
-
-        add(bench_line.compare(quick=options.quick, runs=options.runs or bench_line.RUNS))
-    if 'studies' in names:
-        from benchmarks import bench_studies
-
-        add(bench_studies.compare(quick=options.quick))
-    if 'rates' in names:
-        from benchmarks import bench_studies
-
-        add(bench_studies.rates(quick=options.quick, minutes=options.minutes))
-    if 'repeats' in names:
-        from benchmarks import bench_repeats
-
-        add(bench_repeats.compare(quick=options.quick))
-    if 'continuum' in names:
-        from benchmarks import bench_continuum
-
-        add(bench_continuum.compare(quick=options.quick))
-        add(bench_continuum.little_damped(quick=options.quick))
-    if 'compressible' in names:
-        from benchmarks import bench_compressible
-
-        add(bench_compressible.compare(quick=options.quick))
-    if 'predictions' in names:
-        from benchmarks import bench_continuum
-
-        add(bench_continuum.predicted(quick=options.quick))
-    if 'beam' in names:
-        from benchmarks import bench_beam
-
-        add(bench_beam.compare(quick=options.quick))
-        add(bench_beam.sequences(quick=options.quick, runs=options.runs or bench_beam.RUNS))
-    if 'beam-identification' in names:
-        from benchmarks import bench_beam
-
-        add(bench_beam.identified(quick=options.quick, runs=options.runs or bench_beam.RUNS))
-    if 'modes' in names:
-        from benchmarks import bench_continuum
-
-        add(bench_continuum.covered(quick=options.quick))
-        add(bench_continuum.identified(quick=options.quick))
-    if 'lockstep' in names:
-        from benchmarks import bench_studies
-
-        add(bench_studies.lockstep(quick=options.quick))
-    for name in ('joints', 'controller', 'recorder', 'player', 'crash', 'feedback'):
-        if name in names and _has_ros(name):
-            add(importlib.import_module(f'benchmarks.bench_{name}').compare(quick=options.quick))
     texts: dict[str, str] = {}
-    if 'faults' in names and _has_ros('faults'):
+    if 'faults' in names:
         from benchmarks import bench_faults
 
         outcomes, failed = bench_faults.run(console, only=options.only, quick=options.quick)
         status = status or failed
         record['faults'] = bench_faults.record(outcomes)
         texts['faults'] = bench_faults.page_text(outcomes)
-    if 'soak' in names and _has_ros('soak'):
+    if 'soak' in names:
         from benchmarks import bench_soak
 
         record['soak'], texts['soak'], failed = bench_soak.run(
@@ -230,8 +160,8 @@ def main(arguments: list[str] | None = None) -> int:
         options.json.write_text(
             json.dumps(record, indent=2, default=str) + '\n', encoding='utf-8')
     if options.page:
-        texts |= {report.key: report.markdown() for report in reports}
-        if remarks:
+        texts |= {x.key: x.markdown() for x in sheets}
+        if remarks := [y for x in sheets for y in x.remarks]:
             texts['machine'] = '\n'.join([where + '.', '', *(f'* {x}' for x in remarks)])
         page = renewed(options.page.read_text(encoding='utf-8'), texts)
         options.page.write_text(page, encoding='utf-8')

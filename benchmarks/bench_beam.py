@@ -122,7 +122,7 @@ def compare(*, quick: bool) -> Sheet:
          'time'), rows, {'rows': figures}, passed)
 
 
-def sequences(*, quick: bool, runs: int) -> Sheet:
+def sequences(*, quick: bool, runs: int = RUNS) -> Sheet:
     """Return the largest of what modal leaves in random sequences."""
     random = np.random.default_rng(48)
     rows, figures, passed = [], [], True
@@ -151,7 +151,7 @@ def sequences(*, quick: bool, runs: int) -> Sheet:
          'time, longest'), rows, {'rows': figures}, passed)
 
 
-def identified(*, quick: bool, runs: int) -> Sheet:
+def identified(*, quick: bool, runs: int = RUNS) -> Sheet:
     """Return how recordings of random angles identify the beam, whose mode's shape is given."""
     rows, figures, sums = [], [], [0, 0, 0, 0]
     for ratio in _RATIOS[:1] if quick else _RATIOS:

@@ -174,7 +174,7 @@ _ERRORS = {_JITTER: 5e-6, _LARGE_JITTER: 2e-5}
 
 def robustness(*, quick: bool = False, runs: int = ROBUST_RUNS) -> Sheet:
     """Identify simulated runs with bad samples or bad start values."""
-    runs = QUICK_RUNS if quick else runs
+    runs = QUICK_RUNS if quick else min(runs, ROBUST_RUNS)
     levels = levels_of(False, 15)
     times = np.arange(int(1000 * DURATION)) * 1e-3
     blank = Measurement(times, np.linspace(1.0, 1.5, len(times)), *levels)

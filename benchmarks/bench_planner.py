@@ -23,8 +23,9 @@ import venv
 import numpy as np
 
 from benchmarks import contenders
-from benchmarks.measure import Contender, loosest, race, Report, Row, stopwatch
+from benchmarks.measure import Contender, loosest, race, Row, stopwatch, table
 from benchmarks.reference import Actuator, two_step
+from benchmarks.sheet import Sheet
 from hmsa import motion
 from hmsa.model.creep import Creep
 from hmsa.model.delivery import Delivery
@@ -168,7 +169,7 @@ def _c_programs(
     return found
 
 
-def compare(*, quick: bool = False) -> Report:
+def compare(*, quick: bool = False) -> Sheet:
     """Measure all installed contenders."""
     rounds = 1 if quick else 15
     reference = Reference()
@@ -213,15 +214,15 @@ def compare(*, quick: bool = False) -> Report:
             rows += race([_external(
                 'GNU Octave, ode45 and fzero', program, reference, 2, LIMIT, start=1e-10)], 1)
     rows += [Row(name, note=NOT_INSTALLED) for name in missing]
-    return Report(
+    return table(
         'planner', 'Two-step plans: nine moves, zeta 0.2, J_lim 5, c1 2', 'time per plan',
-        'error in beta_p', rows)
+        'error in beta_p', rows, _summary(rows))
 
 
-def summary(report: Report) -> list[str]:
+def _summary(rows: list[Row]) -> list[str]:
     """Return the results of the batch function as sentences."""
     lines = []
-    batches = [x for x in report.rows if x.name.startswith('plan_two_step_batch')]
+    batches = [x for x in rows if x.name.startswith('plan_two_step_batch')]
     for one in (x for x in batches if x.name.endswith('1 thread')):
         lines.append(f'batch, {one.setting}, 1 thread: {1.0 / one.least:,.0f} plans/s')
         for row in batches:
@@ -248,12 +249,12 @@ CHOICES = [
 ]
 
 
-def choices(*, quick: bool = False) -> Report:
+def choices(*, quick: bool = False) -> Sheet:
     """Measure the effect of guess, derivatives and coarse integrations, in C, at equal error."""
     title = 'What the choices are worth, in the C program; error below 1e-11'
     if contenders.compiler() is None:
-        return Report('choices', title, 'time per plan', 'error in beta_p',
-                      [Row('C', note=NOT_INSTALLED)])
+        return table('choices', title, 'time per plan', 'error in beta_p',
+                     [Row('C', note=NOT_INSTALLED)])
     reference = Reference()
     with tempfile.TemporaryDirectory() as folder:
         entries = []
@@ -264,7 +265,7 @@ def choices(*, quick: bool = False) -> Report:
                 10 if quick else 1000, 1e-11)
             entries.append(replace(entry, setting=passes))
         rows = race(entries, 1 if quick else 10)
-    return Report('choices', title, 'time per plan', 'error in beta_p', rows)
+    return table('choices', title, 'time per plan', 'error in beta_p', rows)
 
 
 _FIRST = (
@@ -292,7 +293,7 @@ def _process(command: list[str]) -> list[float]:
     return [span, _children() - before, *printed]
 
 
-def start_up(*, quick: bool = False) -> Report:
+def start_up(*, quick: bool = False) -> Sheet:
     """Measure the first plan of a new process and of a new installation."""
     _process([sys.executable, '-c', _FIRST])
     runs = [_process([sys.executable, '-c', _FIRST]) for _ in range(1 if quick else 9)]
@@ -302,7 +303,7 @@ def start_up(*, quick: bool = False) -> Report:
             for name, times in zip(names, zip(*runs, strict=True), strict=True)]
     if not quick:
         rows += _installed()
-    return Report('start', 'Start', 'time', 'error', rows)
+    return table('start', 'Start', 'time', 'error', rows)
 
 
 def _installed() -> list[Row]:

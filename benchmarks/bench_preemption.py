@@ -16,7 +16,8 @@ from time import monotonic, perf_counter, thread_time
 
 import numpy as np
 
-from benchmarks.measure import Report, Row
+from benchmarks.measure import Row, table
+from benchmarks.sheet import Sheet
 
 MODES = (
     ('two_step', {}),
@@ -29,13 +30,13 @@ _SPACING_NS = 3_000_000
 _TARGETS = np.random.default_rng(1).uniform(0.8, 1.4, 4096)
 
 
-def compare(*, quick: bool = False) -> Report:
+def compare(*, quick: bool = False) -> Sheet:
     """Measure all modes; the column of times is the 99th percentile."""
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     count = 20 if quick else 2000
     rows = [own_time(name, parameters, count) for name, parameters in MODES]
     rows.append(round_trip(count // 4))
-    return Report(
+    return table(
         'preemption', f'Pre-emption of a moving actuator, {count} requests a mode', '99 %', '',
         rows)
 

@@ -9,11 +9,7 @@ import statistics
 from time import perf_counter
 from typing import Any
 
-from rich.console import Console
-from rich.table import Table
-
-# Headings of columns without numbers.
-_TEXT = ('', 'setting', 'remark')
+from benchmarks.sheet import Sheet
 
 Clock = Callable[[], tuple[float, float]]
 
@@ -114,55 +110,29 @@ def text_of_time(seconds: float | None) -> str:
     return f'{seconds * 1e9:.3g} ns'
 
 
-@dataclass(frozen=True)
-class Report:
-    """A table of rows."""
-
-    key: str  # name in the JSON file
-    title: str
-    unit: str  # heading of the times
-    error: str  # heading of the errors
-    rows: list[Row]  # the others are compared with the first
-
-    def _cells(self) -> tuple[list[str], list[list[str]]]:
-        head = ['', 'setting', self.unit, 'median', 'ratio', self.error, 'remark']
-        base = self.rows[0].least
-        body = []
-        for row in self.rows:
-            ratio = '-'
-            if row.least is not None and base is not None:
-                ratio = f'{row.least / base:.3g}'
-                if row.least / base >= 1000.0:
-                    ratio = f'{row.least / base:,.0f}'
-            error = '-' if row.error is None or math.isnan(row.error) else f'{row.error:.1e}'
-            body.append([
-                row.name, row.setting, text_of_time(row.least), text_of_time(row.median), ratio,
-                error, row.note])
-        # An empty column is left out.
-        used = [i for i in range(len(head))
-                if i == 0 or any(cells[i] not in ('', '-') for cells in body)]
-        return [head[i] for i in used], [[cells[i] for i in used] for cells in body]
-
-    def show(self, console: Console) -> None:
-        """Print the table."""
-        head, body = self._cells()
-        table = Table(title=self.title, title_justify='left')
-        for name in head:
-            table.add_column(name, justify='left' if name in _TEXT else 'right')
-        for cells in body:
-            table.add_row(*cells)
-        console.print(table)
-
-    def markdown(self) -> str:
-        """Return the table for a page of the documentation."""
-        head, body = self._cells()
-        rule = ['---' if name in _TEXT else '--:' for name in head]
-        lines = ['| ' + ' | '.join(cells) + ' |' for cells in [head, rule, *body]]
-        return '\n'.join([f'**{self.title}**', '', *lines, ''])
-
-    def record(self) -> dict[str, Any]:
-        """Return the report for a JSON file."""
-        return asdict(self)
+def table(
+        key: str, title: str, unit: str, error: str, rows: Sequence[Row],
+        remarks: Sequence[str] = ()) -> Sheet:
+    """Return rows as a table, with headings of times and errors, compared with the first one."""
+    head = ['', 'setting', unit, 'median', 'ratio', error, 'remark']
+    base = rows[0].least
+    body = []
+    for row in rows:
+        ratio = '-'
+        if row.least is not None and base is not None:
+            ratio = f'{row.least / base:.3g}'
+            if row.least / base >= 1000.0:
+                ratio = f'{row.least / base:,.0f}'
+        off = '-' if row.error is None or math.isnan(row.error) else f'{row.error:.1e}'
+        body.append([
+            row.name, row.setting, text_of_time(row.least), text_of_time(row.median), ratio, off,
+            row.note])
+    # An empty column is left out.
+    used = [i for i in range(len(head))
+            if i == 0 or any(cells[i] not in ('', '-') for cells in body)]
+    return Sheet(
+        key, title, [head[i] for i in used], [[cells[i] for i in used] for cells in body],
+        {'rows': [asdict(x) for x in rows]}, remarks=remarks)
 
 
 def ros_domain() -> int:

@@ -7,6 +7,9 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+# Headings of columns without numbers, besides the first one.
+_TEXT = ('setting', 'remark')
+
 
 @dataclass(frozen=True)
 class Sheet:
@@ -14,26 +17,34 @@ class Sheet:
 
     key: str  # name in the JSON file and in the marks of a page
     title: str
-    head: Sequence[str]  # of a first column of text and further columns of numbers
+    head: Sequence[str]  # of a first column of text and further columns, most of numbers
     rows: Sequence[Sequence[str]]
     figures: Mapping[str, Any] = field(default_factory=dict)  # the same in full, for JSON
     passed: bool = True  # whether the goals are met
     legend: Sequence[str] = ()  # what the columns mean, one each
+    remarks: Sequence[str] = ()  # what follows, beside the machine on a page
+
+    @property
+    def _texts(self) -> list[bool]:
+        """Whether each column is one of text."""
+        return [i == 0 or name in _TEXT for i, name in enumerate(self.head)]
 
     def show(self, console: Console) -> None:
         """Print the table."""
         table = Table(title=self.title, title_justify='left')
-        for i, name in enumerate(self.head):
-            table.add_column(name, justify='right' if i else 'left')
+        for name, is_text in zip(self.head, self._texts, strict=True):
+            table.add_column(name, justify='left' if is_text else 'right')
         for cells in self.rows:
             table.add_row(*cells)
         console.print(table)
         for text in self.legend:
             console.print(f'* {text}', markup=False, highlight=False)
+        for text in self.remarks:
+            console.print(text)
 
     def markdown(self) -> str:
         """Return the table for a page of the documentation."""
-        rule = ['---', *['--:'] * (len(self.head) - 1)]
+        rule = ['---' if x else '--:' for x in self._texts]
         lines = ['| ' + ' | '.join(cells) + ' |' for cells in (self.head, rule, *self.rows)]
         legend = [f'* {x}' for x in self.legend]
         return '\n'.join([

@@ -23,7 +23,7 @@ from benchmarks import (
 )
 from benchmarks.bounds import bound
 from benchmarks.laboratory import Change, Device, drawn, KINDS, Plant
-from benchmarks.measure import Contender, loosest, race, Report, Row, text_of_time
+from benchmarks.measure import Contender, loosest, race, Row, table, text_of_time
 from benchmarks.reference import Actuator, response, two_step
 from benchmarks.sheet import Sheet
 
@@ -70,9 +70,9 @@ def test_quick_run_prints_and_writes_what_it_measured(tmp_path, capsys):
     assert program.main(
         ['plant', '--quick', '--json', str(file), '--page', str(page)]) == 0
     record = json.loads(file.read_text())['plant']
-    assert record['rows']
-    assert all(x['error'] <= bench_plant.LIMIT and 0.0 < x['least'] <= x['median']
-               for x in record['rows'])
+    rows = record['figures']['rows']
+    assert rows
+    assert all(x['error'] <= bench_plant.LIMIT and 0.0 < x['least'] <= x['median'] for x in rows)
     assert record['title'] in page.read_text()
     assert record['title'] in capsys.readouterr().out
 
@@ -220,10 +220,10 @@ def test_a_verdict_is_wrong_where_the_truth_is_the_reverse(within, verdict, said
 
 
 def test_table_compares_to_its_first_row_and_leaves_empty_columns_out():
-    report = Report('x', 'Title', 'time', 'error', [
+    sheet = table('x', 'Title', 'time', 'error', [
         Row('ours', 'fine', 2e-6, 3e-6), Row('theirs', 'coarse', 5e-3, 6e-3),
         Row('other', note='not installed')])
-    assert report.markdown().splitlines() == [
+    assert sheet.markdown().splitlines() == [
         '**Title**', '',
         '|  | setting | time | median | ratio | remark |',
         '| --- | --- | --: | --: | --: | --- |',
