@@ -15,7 +15,7 @@ from benchmarks.faults.table import Seen
 from hmsa.errors import HmsaError
 from hmsa_ros.middleware import PROFILES
 
-FAULTS = Register()
+FAULTS = Register(unavailable)
 _ONLOOKER = ROOT / 'test' / 'onlooker.py'
 
 
@@ -67,8 +67,6 @@ def wait(condition: Callable[[], bool], what: str) -> None:
 
 
 def _outage(rig: Rig, seconds: float) -> Seen:
-    if why := unavailable():
-        return Seen(f'not tried: {why}', '-', met=True)
     with hosts('bench', 'desk') as made:
         apart = _Apart(rig, made)
         plant = apart.node('bench', 'plant', '--ros-args', '-p', 'safe_flux:=zero')
@@ -99,11 +97,11 @@ def _outage(rig: Rig, seconds: float) -> Seen:
 
 
 for _seconds in (2.0, 25.0):
-    FAULTS.fault(
+    FAULTS.add(
         f'hosts_outage_{_seconds:g}', f'hosts apart for {_seconds:g} s',
         'network namespaces; link down at 1.35, safe_flux zero; later a request of 1.2',
-        'no field until the request; outage and cut-off reported; next move shaped')(
-            lambda rig, seconds=_seconds: _outage(rig, seconds))
+        'no field until the request; outage and cut-off reported; next move shaped',
+        _outage, _seconds)
 
 
 @FAULTS.fault(
@@ -111,8 +109,6 @@ for _seconds in (2.0, 25.0):
     'network namespaces; commands lost in mid-sequence, from before the stop until after it',
     'exit 1, which names the missing acknowledgement; at rest once commands arrive')
 def _stop(rig: Rig) -> Seen:
-    if why := unavailable():
-        return Seen(f'not tried: {why}', '-', met=True)
     with hosts('bench', 'desk') as made:
         apart = _Apart(rig, made)
         apart.node('bench', 'plant')
@@ -140,8 +136,6 @@ def _stop(rig: Rig) -> Seen:
     'restart of the plant',
     'both nodes name it; the first request is rejected (`unheard`), the second one arrives')
 def _address(rig: Rig) -> Seen:
-    if why := unavailable():
-        return Seen(f'not tried: {why}', '-', met=True)
     options = 'plant', '--ros-args', '-p', 'safe_flux:=zero'
     with hosts('bench', 'desk') as made:
         apart = _Apart(rig, made)
@@ -170,8 +164,6 @@ def _address(rig: Rig) -> Seen:
 
 
 def _recorder(rig: Rig, where: str) -> Seen:
-    if why := unavailable():
-        return Seen(f'not tried: {why}', '-', met=True)
     with hosts('bench', 'desk', 'third') as made:
         apart = _Apart(rig, made)
         plant = apart.node('bench', 'plant')
@@ -192,8 +184,7 @@ def _recorder(rig: Rig, where: str) -> Seen:
 
 
 for _where, _name in (('bench', 'one host'), ('desk', 'two hosts')):
-    FAULTS.fault(
+    FAULTS.add(
         f'hosts_recorder_{_where}', f"a subscriber's host goes away, the others on {_name}",
         'its link down, five moves',
-        'all moves arrive; no gap of 1 s in the samples; receipts continue')(
-            lambda rig, where=_where: _recorder(rig, where))
+        'all moves arrive; no gap of 1 s in the samples; receipts continue', _recorder, _where)

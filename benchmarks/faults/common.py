@@ -1,6 +1,7 @@
 """Code that faults share: a register, and moves that are measured."""
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -22,16 +23,35 @@ Inject = Callable[[Rig], Seen]
 
 
 class Register(list[Fault]):
-    """The faults of one kind, in order."""
+    """
+    The faults of one kind, in order.
+
+    ``unavailable`` returns why they cannot be injected on this machine; empty if they can.
+    """
+
+    def __init__(self, unavailable: Callable[[], str] = str) -> None:
+        super().__init__()
+        self._unavailable = unavailable
 
     def fault(
             self, key: str, name: str, how: str, expected: str) -> Callable[[Inject], Inject]:
         """Return a decorator that registers a function as a fault."""
         def enter(inject: Inject) -> Inject:
-            self.append(Fault(key, name, how, expected, inject))
+            self.add(key, name, how, expected, inject)
             return inject
 
         return enter
+
+    def add(
+            self, key: str, name: str, how: str, expected: str, inject: Callable[..., Seen],
+            *arguments: Any) -> None:
+        """Register a function with further arguments as a fault."""
+        def injected(rig: Rig) -> Seen:
+            if why := self._unavailable():
+                return Seen(f'not tried: {why}', '-', met=True)
+            return inject(rig, *arguments)
+
+        self.append(Fault(key, name, how, expected, injected))
 
 
 def pair(

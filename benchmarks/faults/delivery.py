@@ -47,16 +47,10 @@ def _loaded(rig: Rig, lead: float) -> Seen:
     return Seen(f'{late:g} commands late', share(worst), worst < LIMIT and late == 0)
 
 
-@FAULTS.fault(
-    'load', 'both cores loaded', 'four busy processes, lead_time 0.2 s', 'none late')
-def _load(rig: Rig) -> Seen:
-    return _loaded(rig, 0.2)
-
-
-@FAULTS.fault(
-    'load_default', 'both cores loaded', 'four busy processes, lead_time 0.05 s', 'none late')
-def _load_default(rig: Rig) -> Seen:
-    return _loaded(rig, LEAD)
+for _key, _lead in (('load', 0.2), ('load_default', LEAD)):
+    FAULTS.add(
+        _key, 'both cores loaded', f'four busy processes, lead_time {_lead:g} s', 'none late',
+        _loaded, _lead)
 
 
 def _delayed(rig: Rig, part: float) -> Seen:
@@ -71,10 +65,9 @@ def _delayed(rig: Rig, part: float) -> Seen:
 
 
 for _part in (0.0, 0.5, 0.95):
-    FAULTS.fault(
-        f'delay_{_part:g}', f'commands delayed by {_part:g} lead_time',
-        'relay, slow motion', 'none late')(
-            lambda rig, part=_part: _delayed(rig, part))
+    FAULTS.add(
+        f'delay_{_part:g}', f'commands delayed by {_part:g} lead_time', 'relay, slow motion',
+        'none late', _delayed, _part)
 
 
 @FAULTS.fault(

@@ -127,18 +127,16 @@ def _failed(rig: Rig, words: str, reply: str, *texts: str) -> Seen:
 for _name, _word, _call in (
         ('OSError', 'K', 'write'), ('SystemExit', 'K', 'write'),
         ('KeyboardInterrupt', 'S', 'read'), ('MemoryError', 'S', 'read')):
-    FAULTS.fault(
+    FAULTS.add(
         f'driver_{_name.lower()}', f'{_call} raises {_name}', 'a board on a serial line, 20 mT',
-        'off within command_timeout, method and error named, exit 1')(
-            lambda rig, name=_name, word=_word, call=_call: _failed(
-                rig, word, f'RAISE {name}',
-                f'SerialCoil.{call} of joint actuator raised {name}', 'the coil is switched off'))
+        'off within command_timeout, method and error named, exit 1', _failed, _word,
+        f'RAISE {_name}', f'SerialCoil.{_call} of joint actuator raised {_name}',
+        'the coil is switched off')
 
 
-FAULTS.fault(
+FAULTS.add(
     'driver_garbage', 'board answers garbage', 'half a line, then right answers',
-    'off within command_timeout, exit 1')(
-        lambda rig: _failed(rig, 'KS', '#*;S 1.', 'SerialCoil'))
+    'off within command_timeout, exit 1', _failed, 'KS', '#*;S 1.', 'SerialCoil')
 
 
 @FAULTS.fault(
@@ -248,11 +246,10 @@ def _hung(rig: Rig, word: str, method: str) -> Seen:
 
 
 for _word, _call in (('K', 'write'), ('S', 'read')):
-    FAULTS.fault(
+    FAULTS.add(
         f'driver_{_call}_blocks', f'{_call} does not return',
         'the board obeys, but does not answer',
-        'off from another thread after hardware.timeout, exit 1 within 5 s')(
-            lambda rig, word=_word, call=_call: _hung(rig, word, call))
+        'off from another thread after hardware.timeout, exit 1 within 5 s', _hung, _word, _call)
 
 
 @FAULTS.fault(
@@ -345,16 +342,14 @@ def _stalled(rig: Rig, who: str, latest: float) -> Seen:
             not again and off < latest)
 
 
-FAULTS.fault(
-    'driver_planner_stalled', 'planner stopped for longer than command_timeout',
-    f'SIGSTOP for {_STALL:g} s in mid-sequence, SIGCONT; a board on a serial line',
-    'off within command_timeout of the last heartbeat, and until a request; status `cut_off`')(
-        lambda rig: _stalled(rig, 'planner', _TIMEOUT + 0.4))
-FAULTS.fault(
-    'driver_stalled', 'driver stopped for longer than command_timeout',
-    f'SIGSTOP for {_STALL:g} s in mid-sequence, SIGCONT; a board on a serial line',
-    'off as soon as it continues, and until a request; status `cut_off`')(
-        lambda rig: _stalled(rig, 'driver', _STALL + 0.3))
+for _key, _who, _off, _latest in (
+        ('driver_planner_stalled', 'planner', 'within command_timeout of the last heartbeat',
+         _TIMEOUT + 0.4),
+        ('driver_stalled', 'driver', 'as soon as it continues', _STALL + 0.3)):
+    FAULTS.add(
+        _key, f'{_who} stopped for longer than command_timeout',
+        f'SIGSTOP for {_STALL:g} s in mid-sequence, SIGCONT; a board on a serial line',
+        f'off {_off}, and until a request; status `cut_off`', _stalled, _who, _latest)
 
 
 @FAULTS.fault(

@@ -65,10 +65,10 @@ def _difference(
 for _name, _what in (
         ('remanence', 'remanence'), ('shear_modulus', 'modulus'),
         ('damping_coefficient', 'damping')):
-    FAULTS.fault(
+    FAULTS.add(
         f'mismatch_{_name}', f'parameter error in {_what}',
         ', '.join(f'{100 * x:g}' for x in _SHARES) + ' %, 1 -> 1.2',
-        f'stretch as simulated, to {_SAME:g}')(lambda rig, name=_name: _mismatch(rig, name))
+        f'stretch as simulated, to {_SAME:g}', _mismatch, _name)
 
 
 @FAULTS.fault(

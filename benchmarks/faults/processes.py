@@ -217,11 +217,10 @@ def _watchdog(rig: Rig, safe: str) -> Seen:
 for _safe, _what in (
         ('hold', 'field stays'), ('zero', 'field zero in one step'),
         ('ramp', f'field falls at {_RAMP:g} T/s')):
-    FAULTS.fault(
+    FAULTS.add(
         f'watchdog_{_safe}', f'planner dies, safe_flux {_safe}',
         f'command_timeout {_TIMEOUT:g} s',
-        f'{_what} after the timeout, reported; a new planner takes over')(
-            lambda rig, safe=_safe: _watchdog(rig, safe))
+        f'{_what} after the timeout, reported; a new planner takes over', _watchdog, _safe)
 
 
 @FAULTS.fault(

@@ -58,10 +58,9 @@ for _fault, _name, _how, _expected, _word, _counter in (
         ('swap', 'samples in the wrong order', 'pairs swapped', 'sorted', '', ''),
         ('twice', 'doubled samples', 'each sent twice', 'skipped', '', ''),
         ('silence', 'silent sensor', 'no samples', 'open loop', '', '')):
-    FAULTS.fault(
-        f'sensor_{_fault}', f'{_name}, adapt', _how, _expected)(
-            lambda rig, fault=_fault, word=_word, counter=_counter: _failing(
-                rig, fault, word, counter))
+    FAULTS.add(
+        f'sensor_{_fault}', f'{_name}, adapt', _how, _expected, _failing, _fault, _word,
+        _counter)
 
 
 @FAULTS.fault(
