@@ -9,7 +9,6 @@ time from the last message in the bag to the kill.
 """
 
 import contextlib
-import os
 from pathlib import Path
 import random
 import statistics
@@ -18,7 +17,6 @@ import sys
 import tempfile
 import time
 
-ROOT = Path(__file__).resolve().parent.parent
 RATE = 1000.0
 FLUSH_PERIOD = 0.5
 # Recorders that run at the same time.
@@ -88,16 +86,12 @@ class Recorder:
 
 def compare(*, quick):
     """Kill, measure, and return the table; passed if no loss exceeds the flush period."""
-    from benchmarks.measure import ros_domain
+    from benchmarks.measure import keep_local
     from benchmarks.sheet import Sheet
     kills = 2 if quick else 50
-    os.environ['ROS_DOMAIN_ID'] = str(ros_domain())
-    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-    environment = {**os.environ, 'PYTHONPATH': str(ROOT)}
-    os.environ['PYTHONPATH'] = str(ROOT)
+    keep_local()
     sender = subprocess.Popen(
-        [sys.executable, str(Path(__file__).resolve())], stderr=subprocess.DEVNULL,
-        env=environment)
+        [sys.executable, str(Path(__file__).resolve())], stderr=subprocess.DEVNULL)
     dice = random.Random(1)
     losses, count, missing = [], 0, 0
     recorders = []

@@ -10,7 +10,6 @@ that only sleeps, which shows the machine's own limit at that moment.
 """
 
 import json
-import os
 from pathlib import Path
 import signal
 import subprocess
@@ -18,7 +17,6 @@ import sys
 import tempfile
 import time
 
-ROOT = Path(__file__).resolve().parent.parent
 START = 1_700_000_000 * 10**9
 
 
@@ -43,7 +41,7 @@ def receive():
     import rclpy
     from rclpy.qos import HistoryPolicy, QoSProfile
     from std_msgs.msg import Float64
-    sys.path.insert(0, str(ROOT))
+
     from hmsa_ros.nodes.capture import Capture, RawSubscription
     ended = []
     signal.signal(signal.SIGINT, lambda *_: ended.append(True))
@@ -81,14 +79,12 @@ def cells(errors):
 def play(folder, speed):
     """Play a bag at a speed; return the timestamps and numbers received."""
     import struct
-    environment = {**os.environ, 'PYTHONPATH': str(ROOT)}
     receiver = subprocess.Popen(
-        [sys.executable, str(Path(__file__).resolve())], stdout=subprocess.PIPE, env=environment)
+        [sys.executable, str(Path(__file__).resolve())], stdout=subprocess.PIPE)
     subprocess.run(
         [sys.executable, '-m', 'hmsa_ros', 'player', '--ros-args', '--log-level', 'warn', '-p',
          f'storage.uri:={folder}', '-p', f'play.rate:={float(speed)}', '-p',
-         'play.wait_for_subscribers:=[/load]'], env=environment, check=True,
-        stdout=subprocess.DEVNULL)
+         'play.wait_for_subscribers:=[/load]'], check=True, stdout=subprocess.DEVNULL)
     receiver.send_signal(signal.SIGINT)
     received = json.loads(receiver.communicate()[0])
     return ([stamp for stamp, _ in received],
@@ -97,11 +93,10 @@ def play(folder, speed):
 
 def compare(*, quick):
     """Write, play, and return the table; passed if in order, and at rate 1 99 % within 1 ms."""
-    from benchmarks.measure import ros_domain
+    from benchmarks.measure import keep_local
     from benchmarks.sheet import Sheet
     rate, seconds = 1000.0, 2.0 if quick else 30.0
-    os.environ['ROS_DOMAIN_ID'] = str(ros_domain())
-    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+    keep_local()
     count = round(rate * seconds)
     rows, figures, passed = [], {}, True
 

@@ -27,7 +27,6 @@ import sys
 import tempfile
 import time
 
-ROOT = Path(__file__).resolve().parent.parent
 TOPIC = '/load'
 DEPTH = 10_000
 # Raw payload with header and length: 120 bytes.
@@ -136,11 +135,6 @@ def report(count):
     print(json.dumps({'received': count}), flush=True)
 
 
-def environment():
-    """Return the environment variables of the processes."""
-    return {**os.environ, 'PYTHONPATH': str(ROOT), 'PYTHONUNBUFFERED': '1'}
-
-
 def role(*words):
     """Return the command line of one side."""
     return [sys.executable, str(Path(__file__).resolve()), *map(str, words)]
@@ -151,8 +145,7 @@ class Source:
 
     def __init__(self):
         self.process = subprocess.Popen(
-            role('source'), stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment(),
-            text=True)
+            role('source'), stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
     def send(self, rate, seconds):
         """Send; return the number sent and the rate."""
@@ -167,7 +160,7 @@ class Source:
 
 def measure(command, rate, seconds, count):
     """Run a receiver under load; return its figures."""
-    receiver = subprocess.Popen(command, stdout=subprocess.PIPE, env=environment(), text=True)
+    receiver = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     sender = Source()
     figures = sender.send(rate, seconds)
     time.sleep(1.0)
@@ -217,7 +210,7 @@ class Search:
         self._seconds = seconds
         self._end = time.monotonic() + SEARCH_LIMIT_SECONDS
         self._receiver = subprocess.Popen(
-            role('receive', 'bare', ''), stdout=subprocess.PIPE, env=environment(), text=True)
+            role('receive', 'bare', ''), stdout=subprocess.PIPE, text=True)
         self._source = Source()
         self._before = 0
 
@@ -296,11 +289,10 @@ def runs(name, run):
 
 def compare(*, quick):
     """Search, measure, and return the table; passed if the last run lost nothing."""
-    from benchmarks.measure import ros_domain
+    from benchmarks.measure import keep_local
     from benchmarks.sheet import Sheet
     seconds = 2.0 if quick else 60.0
-    os.environ['ROS_DOMAIN_ID'] = str(ros_domain())
-    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+    keep_local()
     found = Search(0.5 if quick else SEARCH_SECONDS).run()
     highest = sustained(found['rate'], seconds) if found is not None else None
     title = 'Recording 120-byte messages of another process'

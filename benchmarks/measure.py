@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 import math
 import os
+from pathlib import Path
 import platform
 import statistics
 from time import perf_counter
@@ -138,6 +139,13 @@ def table(
 def ros_domain() -> int:
     """Return the caller's ROS domain, else one derived from the number of this process."""
     return int(os.environ.get('ROS_DOMAIN_ID') or 1 + os.getpid() % 101)
+
+
+def keep_local() -> None:
+    """Give the ROS processes of this one a domain of their own on this host, and these sources."""
+    os.environ |= {
+        'ROS_DOMAIN_ID': str(ros_domain()), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+        'PYTHONPATH': str(Path(__file__).resolve().parent.parent), 'PYTHONUNBUFFERED': '1'}
 
 
 def machine() -> dict[str, Any]:
