@@ -46,7 +46,7 @@ _MORE_SHAPES = dict(sorted({0.05: (7, 7, 1), 0.2: (6, 6, 2), **SHAPES}.items()))
 TARGETS = (0.9, 1.1, 1.2)
 # Damping ratios of the paper's model about rest.
 _RATIO, _LITTLE = 0.08, 0.02
-_J_LIM = 5.0
+J_LIM = 5.0
 # Limits of what modal may leave at its default order and at order 3, and of the relative error of
 # a prediction.
 _MOST, _MOST_3, _APART = 3.0, 1.0, 0.2
@@ -98,11 +98,7 @@ def _left(
         names: Sequence[str] = ('step', 'paper', 'first', 'modal', 'modal 3')
 ) -> Iterator[tuple[str, float]]:
     """Yield names and vibrations in % of the step, and times in units of that of the paper."""
-    with unquestioned():  # of flat blocks
-        paper = Actuator(
-            half_thickness=0.01 * shape, damping_ratio=damping_ratio, chain_limit=_J_LIM)
-        # The same coefficient: as from a data sheet, not from the ringing.
-        block = paper.replace(mount='free')
+    paper, block = blocks(shape, damping_ratio)
     unit = paper.block.time_unit
     period = block.block.period / unit
     first = {}
@@ -125,6 +121,15 @@ def _left(
         yield f'{name} time', first[name].duration / first['paper'].duration
 
 
+def blocks(shape: float, damping_ratio: float = _RATIO) -> tuple[Actuator, Actuator]:
+    """Return a block of some H/L as the paper has it, and with all modes of a free one."""
+    with unquestioned():  # of flat blocks
+        paper = Actuator(
+            half_thickness=0.01 * shape, damping_ratio=damping_ratio, chain_limit=J_LIM)
+        # The same coefficient: as from a data sheet, not from the ringing.
+        return paper, paper.replace(mount='free')
+
+
 def _slowed(move: Move, factor: float) -> Move:
     return move._replace(
         duration=move.duration * factor,
@@ -134,7 +139,7 @@ def _slowed(move: Move, factor: float) -> Move:
 def _vibration(shape: float, paper: Actuator, move: Move, period: float, target: float) -> float:
     """Return the peak to peak of the mean stretch in a period after the arrival, in %."""
     material = paper.model.material
-    elements = Block(shape, _J_LIM, material.zeta * material.c1 / 6.0, _MORE_SHAPES[shape])
+    elements = Block(shape, J_LIM, material.zeta * material.c1 / 6.0, _MORE_SHAPES[shape])
     arrival = move.duration if math.isfinite(move.duration) else 0.5 * period
     ends = [*(x.time for x in move.levels[1:]), arrival + period]
     times, stretch = elements.follow([
@@ -156,10 +161,7 @@ def predicted(*, quick: bool) -> Sheet:
     rows, figures, worst = [], [], 1.0
     shapers = _PREDICTED[:2] if quick else _PREDICTED
     for shape, target in _CASES[2:3] if quick else _CASES:
-        with unquestioned():
-            paper = Actuator(
-                half_thickness=0.01 * shape, damping_ratio=_RATIO, chain_limit=_J_LIM)
-            block = paper.replace(mount='free')
+        paper, block = blocks(shape)
         material, unit = block.model.material, paper.block.time_unit
         held = _PUSH * abs(float(elastic_force(target, material)))
         cells = []
@@ -200,14 +202,13 @@ _OWN = 30
 
 def recorded(shape: float) -> tuple[Actuator, Measurement]:
     """Return the paper's model of a block, and samples of its finite elements without noise."""
-    with unquestioned():
-        paper = Actuator(half_thickness=0.01 * shape, damping_ratio=_RATIO, chain_limit=_J_LIM)
+    paper, _ = blocks(shape)
     block, material = paper.block, paper.model.material
     dwell, count = _DWELL * block.period, int(_DURATION / (_DWELL * block.period))
     times = np.append(0.0, 2.0 * block.period + dwell * np.arange(count))
     loads = np.append(0.0, elastic_force(np.resize(_STEPS, count), material))
     unit = block.time_unit
-    elements = Block(shape, _J_LIM, material.zeta * material.c1 / 6.0, SHAPES[shape])
+    elements = Block(shape, J_LIM, material.zeta * material.c1 / 6.0, SHAPES[shape])
     moved, stretch = elements.follow([*zip(
         np.diff(np.append(times, _DURATION)) / unit, loads.tolist(), strict=True)])
     samples = np.arange(int(_DURATION * _RATE)) / _RATE

@@ -14,7 +14,7 @@ import math
 import numpy as np
 
 from benchmarks.beam_rod import FIRST, Rod
-from benchmarks.bench_continuum import SHAPES
+from benchmarks.bench_continuum import blocks, J_LIM, SHAPES
 from benchmarks.block_elements import Block
 from benchmarks.sheet import Sheet
 from hmsa import Actuator
@@ -25,8 +25,7 @@ from hmsa.model.laws.elastica import FIRST_SHARE
 
 #: Repeats after the first one, and H/L of free blocks and of those glued with a face.
 REPEATS, BLOCKS, GLUED = 6, (0.1, 0.5, 1.0, 2.0), (0.5, 1.0)
-# Damping ratio and chain limit of blocks, and damping ratio of the beam.
-_RATIO, _J_LIM, _BEAM_RATIO = 0.08, 5.0, 0.03
+_BEAM_RATIO = 0.03  # damping ratio of the beam
 # Periods that a setpoint is held, samples in each, and their noise relative to the step.
 _HOLD, _SAMPLES, _NOISE = 10, 60, 1e-3
 # What may be left at the end, in %.
@@ -53,14 +52,13 @@ def compare(*, quick: bool) -> Sheet:
 
 
 def _block(shape: float, *, glued: bool = False) -> list[float]:
-    with unquestioned():  # of flat blocks
-        block = Actuator(half_thickness=0.01 * shape, damping_ratio=_RATIO, chain_limit=_J_LIM)
+    block, _ = blocks(shape)
     material, unit = block.model.material, block.block.time_unit
 
     def play(times: Array, levels: Array, samples: Array) -> Array:
         height = 2.0 * shape if glued else shape
         elements = Block(
-            height, _J_LIM, material.zeta * material.c1 / 6.0, SHAPES[height], glued=glued)
+            height, J_LIM, material.zeta * material.c1 / 6.0, SHAPES[height], glued=glued)
         ends = np.append(times[1:], samples[-1]) / unit
         seen, stretch = elements.follow(list(zip(
             (ends - times / unit).tolist(), block.model.units.of_level(levels).tolist(),
