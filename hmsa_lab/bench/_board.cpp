@@ -10,13 +10,14 @@ namespace {
 
 using hmsa::Board;
 
-// Return the board in a bytearray argument; nullptr with an exception if it is invalid.
-Board *board_in(PyObject *state) {
+// Converts a bytearray argument to the board in it; an exception if it is invalid.
+int board_in(PyObject *state, void *board) {
     if (!PyByteArray_Check(state) || PyByteArray_GET_SIZE(state) != sizeof(Board)) {
         PyErr_SetString(PyExc_TypeError, "expected what make has returned");
-        return nullptr;
+        return 0;
     }
-    return reinterpret_cast<Board *>(PyByteArray_AS_STRING(state));
+    *static_cast<Board **>(board) = reinterpret_cast<Board *>(PyByteArray_AS_STRING(state));
+    return 1;
 }
 
 PyObject *make(PyObject *, PyObject *arguments) {
@@ -32,15 +33,11 @@ PyObject *make(PyObject *, PyObject *arguments) {
 }
 
 PyObject *receive(PyObject *, PyObject *arguments) {
-    PyObject *state;
+    Board *board;
     const char *text;
     Py_ssize_t length;
     long long now;
-    if (!PyArg_ParseTuple(arguments, "Oy#L", &state, &text, &length, &now)) {
-        return nullptr;
-    }
-    Board *board = board_in(state);
-    if (!board) {
+    if (!PyArg_ParseTuple(arguments, "O&y#L", board_in, &board, &text, &length, &now)) {
         return nullptr;
     }
     char answer[4 * hmsa::LONGEST_ANSWER];
@@ -55,24 +52,19 @@ PyObject *receive(PyObject *, PyObject *arguments) {
 }
 
 PyObject *advance(PyObject *, PyObject *arguments) {
-    PyObject *state;
+    Board *board;
     long long now;
-    if (!PyArg_ParseTuple(arguments, "OL", &state, &now)) {
+    if (!PyArg_ParseTuple(arguments, "O&L", board_in, &board, &now)) {
         return nullptr;
     }
-    Board *board = board_in(state);
-    return board ? PyLong_FromLong(board->advance(now)) : nullptr;
+    return PyLong_FromLong(board->advance(now));
 }
 
 PyObject *sample(PyObject *, PyObject *arguments) {
-    PyObject *state;
+    Board *board;
     long long time;
     int reading;
-    if (!PyArg_ParseTuple(arguments, "OLi", &state, &time, &reading)) {
-        return nullptr;
-    }
-    Board *board = board_in(state);
-    if (!board) {
+    if (!PyArg_ParseTuple(arguments, "O&Li", board_in, &board, &time, &reading)) {
         return nullptr;
     }
     board->sample(time, reading);
@@ -80,13 +72,9 @@ PyObject *sample(PyObject *, PyObject *arguments) {
 }
 
 PyObject *warm(PyObject *, PyObject *arguments) {
-    PyObject *state;
+    Board *board;
     int temperature;
-    if (!PyArg_ParseTuple(arguments, "Oi", &state, &temperature)) {
-        return nullptr;
-    }
-    Board *board = board_in(state);
-    if (!board) {
+    if (!PyArg_ParseTuple(arguments, "O&i", board_in, &board, &temperature)) {
         return nullptr;
     }
     board->warm(temperature);
@@ -94,8 +82,8 @@ PyObject *warm(PyObject *, PyObject *arguments) {
 }
 
 PyObject *due(PyObject *, PyObject *state) {
-    Board *board = board_in(state);
-    return board ? PyLong_FromLongLong(board->due()) : nullptr;
+    Board *board;
+    return board_in(state, &board) ? PyLong_FromLongLong(board->due()) : nullptr;
 }
 
 PyMethodDef methods[] = {
