@@ -11,10 +11,5 @@ def _node(name: str) -> Callable[[], int]:
     return lambda: main([name, *sys.argv[1:]])
 
 
-planner = _node('planner')
-plant = _node('plant')
-driver = _node('driver')
-recorder = _node('recorder')
-controller = _node('controller')
-player = _node('player')
-sense = _node('sense')
+planner, plant, driver, recorder, controller, player, sense = map(_node, (
+    'planner', 'plant', 'driver', 'recorder', 'controller', 'player', 'sense'))

@@ -26,7 +26,6 @@ from hmsa.interfaces import topics
 from hmsa.model.units import NANOSECONDS
 from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.conversions import from_time, to_trajectory
-from hmsa_ros.nodes.ros_entities import interface_class
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 #: Maximum wait for a process to start, or for a condition, in s.
@@ -364,7 +363,8 @@ class Rig:
     def call(self, service: topics.Service, owner: str, request: Any = None) -> Any:
         """Call a service of a node."""
         return self.call_by_name(
-            interface_class(service.type), topics.from_outside(service.name, owner), request)
+            ros_entities.interface_class(service.type),
+            topics.from_outside(service.name, owner), request)
 
     def call_by_name(self, kind: type[Any], name: str, request: Any = None) -> Any:
         """Call a service by its name."""

@@ -28,7 +28,6 @@ from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.capture import decode, RawSubscription, Taken
 from hmsa_ros.nodes.conversions import from_time
 from hmsa_ros.nodes.duplicate_nodes import DuplicateNodes
-from hmsa_ros.nodes.ros_entities import interface_class
 from hmsa_ros.nodes.temporary_node import leave, visit
 
 #: Number of slots of a chart.
@@ -283,7 +282,7 @@ class Listener:
     def _subscribe(self, topic: topics.Topic, qos: topics.Quality | None = None) -> _Source:
         source = _Source(
             self._node.resolve_topic_name(topics.from_outside(topic.name, topics.PLANNER)),
-            interface_class(topic.type), ros_entities.listen(
+            ros_entities.interface_class(topic.type), ros_entities.listen(
                 self._node, replace(topic, qos=qos or topic.qos), topics.PLANNER))
         self._sources.append(source)
         return source

@@ -27,7 +27,6 @@ from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.capture import decode, RawSubscription
 from hmsa_ros.nodes.conversions import from_time, to_trajectory
 from hmsa_ros.nodes.duplicate_nodes import DuplicateNodes, LATELY_SECONDS
-from hmsa_ros.nodes.ros_entities import publishers_of, recorders, subscribers_of
 from hmsa_ros.nodes.temporary_node import ServiceCall, SLICE_SECONDS
 
 # Time in s for an existing planner node to subscribe: configuration takes a fraction of a second,
@@ -409,9 +408,9 @@ def _slower_time(node: Node, timeout: float) -> Iterator[Callable[[], float]]:
 
 def unheard(node: Node, namespace: str, joints: Sequence[str]) -> list[str]:
     """Return a planner's command topics without subscribers other than recorders."""
-    leave_out = recorders(node)
+    leave_out = ros_entities.recorders(node)
     return [x for x in _commands(node, namespace, joints)
-            if leave_out.issuperset(subscribers_of(node, x).values())]
+            if leave_out.issuperset(ros_entities.subscribers_of(node, x).values())]
 
 
 def _commands(node: Node, namespace: str, joints: Sequence[str]) -> list[str]:
@@ -420,7 +419,7 @@ def _commands(node: Node, namespace: str, joints: Sequence[str]) -> list[str]:
     named = [
         topic for topic, types in node.get_topic_names_and_types()
         if topics.FLUX_DENSITY_COMMAND.type in types
-        and planner in publishers_of(node, topic).values()]
+        and planner in ros_entities.publishers_of(node, topic).values()]
     return [x for x in named if x.split('/')[-2] in joints] or named or [
         node.resolve_topic_name(
             topics.of_joint(topics.FLUX_DENSITY_COMMAND, x, joints).name) for x in joints]

@@ -15,6 +15,7 @@ from hmsa_ros.clients.client import newest_time, PlannerClient
 from hmsa_ros.clients.experiment import Experiment, START_SECONDS
 from hmsa_ros.clients.remote import remote_parameters
 from hmsa_ros.nodes import ros_entities
+from hmsa_ros.nodes.temporary_node import ServiceCall
 
 # Time limit in s for a sequence to be completed after its duration.
 _GRACE_SECONDS = 20.0
@@ -184,8 +185,9 @@ class ExperimentClient(PlannerClient):
 
     def unpause(self) -> None:
         """Resume simulated time."""
-        call = ros_entities.call(
-            self.node, topics.SET_PAUSED, topics.PLANT, SetBool.Request(data=False))
+        call = ServiceCall(
+            self.node, SetBool, topics.from_outside(topics.SET_PAUSED.name, topics.PLANT),
+            SetBool.Request(data=False))
         for condition, failure in (
                 (lambda: call.ready, 'the plant offers no service to unpause it'),
                 (lambda: call.answer() is not None, 'the plant did not answer'),

@@ -364,11 +364,11 @@ class HardwareWorker:
 
     def stood_still(self, span: int) -> None:
         """Record that this process stood still for some ns."""
-        self._put(lambda: self._stand_still(span))
+        def stand_still() -> None:
+            self.device.advance_to(self._now())
+            self.device.stood_still(span)
 
-    def _stand_still(self, span: int) -> None:
-        self.device.advance_to(self._now())
-        self.device.stood_still(span)
+        self._put(stand_still)
 
     def look_after(self) -> None:
         """Check that the thread is alive and its calls return; otherwise switch off without it."""

@@ -417,11 +417,8 @@ class DeviceNode(ManagedNode):
     def _status_of_commands(self, **values: object) -> DiagnosticStatus:
         """Return the status of the commands, with additional values."""
         joints = self._joints
-        counts = {
-            'late': sum(x.late for x in joints),
-            'refused': sum(x.refused for x in joints),
-            'refused_source': sum(x.refused_source for x in joints),
-            'failed': sum(x.failed for x in joints)}
+        counts = {x: sum(getattr(joint, x) for joint in joints) for x in (
+            'late', 'refused', 'refused_source', 'failed')}
         silent = [joints[i].name for i in self.device.silent]
         level, message = judge_commands(
             **counts, silent=silent, crowded=[x.name for x in joints if x.crowded()],

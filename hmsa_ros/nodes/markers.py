@@ -260,8 +260,7 @@ MARKER_SCALE = ParameterSpec(
     'Scale of ~/markers: metres shown per metre; 1 is true to size.', '', 1e-6, 1e9)
 MARKER_RATE = ParameterSpec(
     'marker_rate', 30.0,
-    'Rate of ~/markers while there is a subscriber; 0 for never.', 'Hz',
-    0.0, 1e3)
+    'Rate of ~/markers while there is a subscriber; 0 for never.', 'Hz', 0.0, 1e3)
 MARKER_FRAME = ParameterSpec('frame_id', 'coil', 'Frame of the markers.')
 
 # A viewer removes a marker that was not sent for this time, or for this number of periods.

@@ -65,8 +65,7 @@ OWN = (
     _changeable(
         'smooth_periods', _OPTIONS.pace.periods,
         'Minimum duration of a move of the shaper smooth in natural periods; limits of flux '
-        'density, slew rate or stretch rate extend it.', '',
-        LEAST_PERIODS, MOST_PERIODS),
+        'density, slew rate or stretch rate extend it.', '', LEAST_PERIODS, MOST_PERIODS),
     _changeable(
         'stretch_rate_max', 0.0,
         'Maximum stretch rate of the shaper smooth; 0 for any.', '1/s', 0.0, 1e12),
@@ -104,8 +103,7 @@ SPECS = (
         'Times at which commands may apply: any time, or only the grid of command_period.',
         choices=('continuous', 'sampled')),
     ParameterSpec(
-        'command_period', 0.001, 'Grid period in command_mode sampled.', 's',
-        1e-9, 1e3),
+        'command_period', 0.001, 'Grid period in command_mode sampled.', 's', 1e-9, 1e3),
     _changeable(
         'max_points', _SETTINGS.max_points,
         'Largest number of setpoints in one trajectory, summed over its joints.', '',
@@ -118,12 +116,10 @@ SPECS = (
     _changeable(
         'short_spell', _OPTIONS.short_spell,
         'What to do if a setpoint is too short for its move: refuse the request, or continue to '
-        'the next setpoint from the state reached.',
-        choices=SHORT_SPELL),
+        'the next setpoint from the state reached.', choices=SHORT_SPELL),
     _changeable(
         'heartbeat_period', _SETTINGS.heartbeat_period / NANOSECONDS,
-        'Heartbeat: period at which the current level is sent again; 0 for never.', 's',
-        0.0, 1e3),
+        'Heartbeat: period at which the current level is sent again; 0 for never.', 's', 0.0, 1e3),
     _changeable(
         'replan_late', _SETTINGS.replan_late,
         'Whether to plan the rest of a sequence again after a late command, if that leaves less '
@@ -131,16 +127,14 @@ SPECS = (
     _changeable(
         'lateness_tolerance', _SETTINGS.lateness_tolerance / NANOSECONDS,
         'Lateness of a command that never counts; more counts by the vibration that it leaves.',
-        's',
-        0.0, 1.0),
+        's', 0.0, 1.0),
     _changeable(
         'arrival_tolerance', _SETTINGS.tolerances.arrival,
         'Maximum steady-state error of an arrived setpoint, as a fraction of the '
         'step.', '', 0.0, 1e3),
     _changeable(
         'vibration_tolerance', _SETTINGS.tolerances.vibration,
-        'Maximum residual vibration, peak to peak, as a fraction of the step.', '',
-        0.0, 1e3),
+        'Maximum residual vibration, peak to peak, as a fraction of the step.', '', 0.0, 1e3),
     _changeable(
         'stretch_tolerance', _SETTINGS.tolerances.stretch,
         'Steady-state error and residual vibration that are tolerated for any step.', '',
@@ -151,8 +145,7 @@ SPECS = (
         'them on ~/estimate; adapt also corrects plans, and plans with the estimate; cautious '
         'also extends moves whose predicted error exceeds feedback_tolerance, to correct them on '
         'the way: three times (five times for six estimated parameters, and up to twice that for '
-        'large noise).',
-        choices=FEEDBACK_MODES),
+        'large noise).', choices=FEEDBACK_MODES),
     ParameterSpec(
         'feedback_parameters', list(_SETTINGS.feedback_parameters),
         'Parameters that feedback estimates: shear_modulus, damping_coefficient, '
@@ -179,8 +172,7 @@ SPECS = (
     _changeable(
         'after_cut_off', _SETTINGS.after_cut_off,
         'Reaction to a cut-off of the coil: drop the rest of the sequence and wait for a request, '
-        'or resume it with a shaped move from the current state.',
-        choices=AFTER_CUT_OFF),
+        'or resume it with a shaped move from the current state.', choices=AFTER_CUT_OFF),
     ParameterSpec(
         'takeover_timeout', _SETTINGS.takeover_timeout / NANOSECONDS,
         'Time that the first request waits for a plant or driver and, if samples are published, '

@@ -58,8 +58,7 @@ OWN = (
         'Stretch after ~/reset, held by its equilibrium flux density; 0 for initial_stretch.', '',
         -1.0, 1e3, read_only=False),
     ParameterSpec(
-        'reset_rate', 0.0, 'Stretch rate after ~/reset.', '1/s', -1e9, 1e9,
-        read_only=False),
+        'reset_rate', 0.0, 'Stretch rate after ~/reset.', '1/s', -1e9, 1e9, read_only=False),
 )
 
 
@@ -152,8 +151,7 @@ PARAMETERS = (
     ParameterSpec(
         'measurement_delay', 0.0,
         'Simulated transport delay of samples: they are published this long after their '
-        'timestamp.',
-        's', 0.0, 1e3),
+        'timestamp.', 's', 0.0, 1e3),
     ParameterSpec(
         'seed', 0, 'Seed of the noise; the same seed gives the same run.', '', 0, 2**31 - 1),
     shared.PUBLISH_RATE,
@@ -164,8 +162,7 @@ PARAMETERS = (
     ParameterSpec(
         'real_time_factor', 1.0,
         'Simulated seconds per real second when the plant publishes /clock; 0 for as fast as '
-        'possible.', '',
-        0.0, 1e6, read_only=False),
+        'possible.', '', 0.0, 1e6, read_only=False),
     ParameterSpec(
         'start_time', 1.0,
         'Initial simulated time; above 0, because a ROS clock at 0 has not started.', 's',

@@ -17,7 +17,6 @@ from hmsa.errors import BadInputError, BagError, listed, printable
 from hmsa.interfaces import topics
 from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.cdr import stamp_of
-from hmsa_ros.nodes.ros_entities import interface_class
 from hmsa_ros.nodes.selection import Filter, is_full_name, publisher_profile, Selection
 from hmsa_ros.nodes.temporary_node import ServiceCall
 
@@ -55,7 +54,7 @@ def create_senders(
         try:
             if not reason:
                 result[name] = node.create_publisher(
-                    interface_class(held[name].type), full[name],
+                    ros_entities.interface_class(held[name].type), full[name],
                     publisher_profile(held[name].profiles))
         except Exception as error:  # an invalid quality of service
             reason = f'it cannot be published ({" ".join(str(error).split())})'
@@ -94,7 +93,7 @@ def _left_out(
     if info.encoding != 'cdr':
         return f'its messages are encoded as {info.encoding!r}, expected cdr'
     try:
-        interface_class(info.type)
+        ros_entities.interface_class(info.type)
     except BagError as error:
         return str(error)
     return ''

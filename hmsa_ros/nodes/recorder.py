@@ -50,7 +50,6 @@ from hmsa_ros.nodes.capture import Capture, decode, RawSubscription, SimulatedTi
 from hmsa_ros.nodes.conversions import from_time, to_status
 from hmsa_ros.nodes.managed import ManagedNode, run
 from hmsa_ros.nodes.parameters import declare
-from hmsa_ros.nodes.ros_entities import interface_class
 from hmsa_ros.nodes.selection import Selection, stored_profile, subscription_profile
 from hmsa_ros.nodes.temporary_node import RemoteParameters
 from hmsa_ros.timekeeping import StepWatch
@@ -197,7 +196,7 @@ class Subscriptions:
             self, known: RecordedTopic | None, name: str, type_name: str,
             offered: tuple[Qos, ...], hashes: Iterable[str]) -> None:
         try:
-            message_type = interface_class(type_name)
+            message_type = ros_entities.interface_class(type_name)
         except BagError as error:
             self._warn(f'topic {name} is not recorded: {error}')
             return
@@ -232,7 +231,7 @@ class Subscriptions:
         """Subscribe to a topic again."""
         topic.qos = qos
         self._capture.replace(topic, RawSubscription(
-            self._node, interface_class(topic.type), topic.name, qos))
+            self._node, ros_entities.interface_class(topic.type), topic.name, qos))
 
     def _describe(
             self, name: str, type_name: str, offered: tuple[Qos, ...],

@@ -20,9 +20,8 @@ from rclpy.subscription import Subscription
 
 from hmsa.bag.definitions import is_interface_package
 from hmsa.errors import BagError
-from hmsa.interfaces.topics import from_outside, Quality, Service, Topic
+from hmsa.interfaces.topics import from_outside, Quality, Topic
 from hmsa_ros.nodes.capture import RawSubscription
-from hmsa_ros.nodes.temporary_node import ServiceCall
 
 # Name of a node that has not been discovered yet, or not any more.
 _UNKNOWN = '_NODE_NAME_UNKNOWN_'
@@ -158,9 +157,3 @@ def listen(node: Node, topic: Topic, owner: str = '') -> RawSubscription:
     """Return a subscription to a topic (see `publisher`) whose messages are polled."""
     return RawSubscription(
         node, interface_class(topic.type), from_outside(topic.name, owner), profile(topic.qos))
-
-
-def call(node: Node, service: Service, owner: str, request: Any) -> ServiceCall:
-    """Return a call of another node's service."""
-    return ServiceCall(
-        node, interface_class(service.type), from_outside(service.name, owner), request)

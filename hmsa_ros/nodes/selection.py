@@ -12,7 +12,6 @@ from rclpy.topic_or_service_is_hidden import topic_or_service_is_hidden
 from hmsa.bag.qos import Qos
 from hmsa.errors import BadInputError
 from hmsa.interfaces import topics
-from hmsa.interfaces.topics import Quality
 from hmsa_ros.nodes import ros_entities
 
 # Depth of a republished topic whose recorded depth is unknown, as for publishers discovered over
@@ -138,7 +137,7 @@ def subscription_profile(offered: Iterable[Qos], depth: int) -> QoSProfile:
     profiles = list(offered)
     reliable = all(profile.reliability == 'reliable' for profile in profiles)
     latched = all(profile.durability == 'transient_local' for profile in profiles)
-    return ros_entities.profile(Quality(depth, reliable, latched))
+    return ros_entities.profile(topics.Quality(depth, reliable, latched))
 
 
 def publisher_profile(recorded: Sequence[Qos]) -> QoSProfile:
@@ -150,7 +149,7 @@ def publisher_profile(recorded: Sequence[Qos]) -> QoSProfile:
     reliable = not recorded or any(
         profile.reliability in ('reliable', 'system_default') for profile in recorded)
     depth = min(MAX_DEPTH, max((profile.depth for profile in recorded), default=0))
-    profile = ros_entities.profile(Quality(
+    profile = ros_entities.profile(topics.Quality(
         depth or (min(MAX_DEPTH, len(recorded)) if latched else PUBLISHER_DEPTH),
         reliable, latched))
     alike = set(recorded)
