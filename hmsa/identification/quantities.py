@@ -108,6 +108,10 @@ QUANTITIES: dict[str, Quantity] = {
 BRANCHES = tuple((f'viscoelastic_ratio{x}', f'viscoelastic_time{x}') for x in _NUMBERS)
 #: Constants of the flow rule of each branch.
 FLOWING = tuple(tuple(f'viscoelastic_{y}{x}' for y in CONSTANTS) for x in _NUMBERS)
+# Each flow rule with the names of its constants.
+_FLOWS = tuple(
+    (flow, tuple(f'viscoelastic_{x.name}{y}' for x in flow.constants for y in _NUMBERS))
+    for flow in FLOWS.values())
 #: Name that frees secondary modes, as many as the recording shows, and the mass factor.
 MODES = 'modes'
 #: Ratio, share, damping ratio and exponents of each secondary mode.
@@ -248,6 +252,7 @@ def complete(values: Mapping[str, Any], free: Iterable[str]) -> dict[str, Any]:
     return done
 
 
+@lru_cache(maxsize=256)
 def quantity_of(name: str) -> Quantity:
     """
     Return a parameter by name, including constants of a model.
@@ -315,10 +320,10 @@ def actuator_of(values: Mapping[str, Any]) -> ActuatorParameters:
 def flow_of(values: Mapping[str, Any], free: Iterable[str]) -> Flow:
     """Return the flow rule of the branches: the one with a constant that is free, or not 1."""
     sought = set(free)
-    for flow in FLOWS.values():
-        if any(name in sought or values[name] != 1.0 for x in flow.constants
-               for name in (f'viscoelastic_{x.name}{y}' for y in _NUMBERS)):
-            return flow
+    for flow, names in _FLOWS:
+        for name in names:
+            if name in sought or values[name] != 1.0:
+                return flow
     return MAXWELL
 
 

@@ -17,6 +17,7 @@ from hmsa.model.creep import Creep
 from hmsa.model.equations import Array
 from hmsa.model.law import KIND, pack
 from hmsa.model.laws.record import Elastic, GENT
+from hmsa.model.parameters import Geometry
 from hmsa.model.thermal import Thermal
 from hmsa.model.units import MU_0
 from hmsa.motion import SPEED
@@ -61,11 +62,18 @@ class Response:
     by_switch: Array  # by the uncertain times of switches, shape (n, u)
 
 
+@lru_cache(maxsize=32)
+def _places(first: int, modes: tuple[tuple[str, ...], ...]) -> dict[str, int]:
+    """Return the indices in theta of parameters that are values of it; modes are from first on."""
+    return {x: i for x, i in _PLACES.items() if i < first} | {
+        x: i for i, x in enumerate((y for names in modes for y in names), first)}
+
+
 def _chain(
-        values: Mapping[str, Any], branches: int, free: Sequence[str]
+        values: Mapping[str, Any], geometry: Geometry, branches: int, free: Sequence[str]
 ) -> tuple[Array, dict[str, dict[int, float]]]:
     """Return theta of the motion and, by name, its derivatives by the free parameters."""
-    geometry, density = quantities.geometry_of(values), values['density']
+    density = values['density']
     inertia = density * geometry.inertia * geometry.half_length ** 2
     modulus, remanence = values['shear_modulus'], values['remanence']
     a, k = modulus / inertia, remanence / (MU_0 * inertia)
@@ -78,10 +86,8 @@ def _chain(
         a, per_damping * values['damping_coefficient'], k, per_force * values['constant_force'])
     by_value = dict(zip(
         _LINEAR.values(), (a / modulus, per_damping, k / remanence, per_force), strict=True))
-    own = {x: i for x, i in _PLACES.items() if i < first} | {
-        x: i for i, x in enumerate((y for names in modes for y in names), first)}
-    for name, i in own.items():
-        theta[i] = values[name]
+    own = _places(first, modes)
+    theta[list(own.values())] = [values[name] for name in own]
     if 'creep' in values:
         rows = np.array(values['creep'].rows())
         rows[:, SPEED] = values['creep'].times
@@ -202,18 +208,20 @@ class ResponseArguments:
             i for i, names in enumerate(quantities.BRANCHES, 1)
             if values[names[0]] > 0.0 or set(names) & set(free)
         ), default=len(values.get('behind', ())))
-        theta, chain = _chain(values, branches, free)
+        geometry = quantities.geometry_of(values)
+        theta, chain = _chain(values, geometry, branches, free)
         inner = sorted({i for x in chain.values() for i in x})
         rows = {x: i for i, x in enumerate(inner)}
         material = _packed(
-            values['chain_limit'], quantities.geometry_of(values).inertia_c1,
-            quantities.energy_of(values)).copy()
+            values['chain_limit'], geometry.inertia_c1, quantities.energy_of(values)).copy()
         if 'chain_limit' in free and math.isinf(values['bulk_ratio']):
             material[KIND] = GENT
         mixing = np.zeros((len(inner) + len(more), len(free) + len(more)))
         for j, name in enumerate(free):
-            for i, x in chain.get(name, {}).items():
-                mixing[rows[i], j] = quantities.derivative(name, values[name]) * x
+            if by := chain.get(name):
+                slope = quantities.derivative(name, values[name])
+                for i, x in by.items():
+                    mixing[rows[i], j] = slope * x
         for j in range(1, len(more) + 1):
             mixing[-j, -j] = 1.0
         return cls(theta, material, branches, np.array([*inner, *more], dtype=np.int64), mixing)
