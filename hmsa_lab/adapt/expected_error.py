@@ -14,6 +14,7 @@ determined.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 import math
 from typing import NamedTuple
 
@@ -240,21 +241,31 @@ def _left(
     """
     try:
         model = model.at_temperature(estimate.values[TEMPERATURE])
-        plan = Planner(
-            replace(model.actuator, thermal=Thermal()),
-            replace(model.options, lead_time=0, period=0), stretch=start).setpoint(target, 0)
+        levels, arrival = _planned(model, start, target)
     except HmsaError:
         return None
-    arrival, holding = plan.segments[-1].arrival, model.flux_density(model.holding(start))
+    holding = model.flux_density(model.holding(start))
     resting = _at_rest(estimate, holding)
     if arrival is None or resting is None:
         return None
-    left = expect(resting, CandidateLevels(
-        tuple((x.stamp, x.flux_density) for x in plan.levels if x.stamp >= 0), arrival, target,
-        holding), model.options.slew_limit)
+    left = expect(
+        resting, CandidateLevels(levels, arrival, target, holding), model.options.slew_limit)
     step = abs(target - start)
     return ExpectedError(left.misses / step, left.covariance / step ** 2) if math.isfinite(
         left.size) else None
+
+
+# The model in use is tried on the same moves after each sample of a setpoint.
+@lru_cache(maxsize=8)
+def _planned(
+        model: JointModel, start: float, target: float
+) -> tuple[tuple[tuple[int, float], ...], int | None]:
+    """Return levels (timestamp in ns, T) and arrival of a move from rest at time 0."""
+    plan = Planner(
+        replace(model.actuator, thermal=Thermal()),
+        replace(model.options, lead_time=0, period=0), stretch=start).setpoint(target, 0)
+    return (tuple((x.stamp, x.flux_density) for x in plan.levels if x.stamp >= 0),
+            plan.segments[-1].arrival)
 
 
 def _at_rest(estimate: StateEstimate, level: float) -> StateEstimate | None:
