@@ -6,7 +6,7 @@ no influence and does not change, and the same data always produce the same byte
 """
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 import csv
 import io
 import itertools
@@ -16,8 +16,10 @@ from typing import Any
 
 from matplotlib import rcParams, style
 from matplotlib.axes import Axes
+from matplotlib.backend_bases import RendererBase
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import (
     AutoMinorLocator,
     FixedFormatter,
@@ -72,6 +74,15 @@ class Picture(Figure):
         with style.context(['default', _SETTINGS]):
             self.savefig(file, format='png', dpi=_NOTEBOOK, metadata=_METADATA['png'])
         return file.getvalue()
+
+    def draw(self, renderer: RendererBase) -> None:
+        """Draw it; only lay it out where `savefig` does so before it draws."""
+        layout = self.get_layout_engine()
+        if self.canvas.is_saving() and isinstance(layout, ConstrainedLayoutEngine):
+            with suppress(ValueError):  # as where it is drawn
+                layout.execute(self)
+        else:
+            super().draw(renderer)
 
     def remember(self, axes: Axes, curve: str, *columns: Any) -> None:
         """Keep columns of data, or a grid (x, y, and z of shape (len(y), len(x))), for export."""
