@@ -125,6 +125,20 @@ class Hypotheses:
         found[places] = 0.5 * np.log(self.priors[places]) - self.prudence[places]
         return found
 
+    @cached_property
+    def eases(self) -> Array:
+        """Contribution of the suspects of each set to the evidence, shape (n,)."""
+        return self.seeking @ self.ease
+
+
+@lru_cache(maxsize=64)
+def _seeking(suspects: Hypotheses, count: int) -> NDArray[np.bool_]:
+    """Return which of ``count`` coordinates are estimated with each set, shape (n, q)."""
+    found = suspects.seeking
+    found = np.pad(found, ((0, 0), (0, count - found.shape[1])), constant_values=True)
+    found.setflags(write=False)
+    return found
+
 
 @lru_cache(maxsize=64)
 def hypotheses(
@@ -224,12 +238,9 @@ class Evidence:
 
         The cost and its derivatives are those at z (D. J. C. MacKay, Neural Comput. 4 (1992) 415).
         """
-        sought = self.suspects.seeking
-        sought = np.pad(
-            sought, ((0, 0), (0, len(self.z) - sought.shape[1])), constant_values=True)
+        sought = _seeking(self.suspects, len(self.z)).copy()
         rest = self.suspects.at_ease(self.z, ()) - self.z
-        found = self._explained(
-            np.where(sought, 0.0, rest), sought, self.suspects.seeking @ self.suspects.ease)
+        found = self._explained(np.where(sought, 0.0, rest), sought, self.suspects.eases)
         evidence = found.evidence.copy()
         beyond = np.any(
             (found.step < self.low - 1e-12) | (found.step > self.high + 1e-12), axis=1)
