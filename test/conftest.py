@@ -406,7 +406,7 @@ def handlers() -> Iterator[None]:
 
 @pytest.fixture(scope='session')
 def fork_server() -> Iterator[Callable[[Mapping[str, str]], ForkServer]]:
-    """Return a function that returns the server of this worker."""
+    """Return a function that returns the server, which all workers use."""
     servers: list[ForkServer] = []
 
     def server(env: Mapping[str, str]) -> ForkServer:

@@ -15,6 +15,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from typing import Any
 
 from hmsa import plugins
@@ -72,15 +73,30 @@ class Forked:
 
 
 class ForkServer:
-    """The process that forks others: it has imported nodes, commands and message types."""
+    """
+    The process that forks others: it has imported nodes, commands and message types.
+
+    The first worker that needs it starts it for all of them; it ends with the last one.
+    """
 
     def __init__(self, env: Mapping[str, str]) -> None:
         self._env = dict(env)
-        self._line, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        with its:
-            self._process = subprocess.Popen(
-                [sys.executable, __file__, str(its.fileno())], env=self._env,
-                pass_fds=[its.fileno()], cwd=ROOT)
+        self._process: subprocess.Popen[bytes] | None = None
+        # In no file system.
+        address = '\0hmsa_forks_' + os.environ.get('PYTEST_XDIST_TESTRUNUID', str(os.getpid()))
+        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as its:
+            try:
+                its.bind(address)
+            except OSError:
+                pass  # of another worker
+            else:
+                its.listen()
+                self._process = subprocess.Popen(
+                    [sys.executable, __file__, str(its.fileno())], env=self._env,
+                    pass_fds=[its.fileno()], cwd=ROOT)
+        self._line = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        while self._line.connect_ex(address):
+            time.sleep(0.01)  # until the other worker listens
 
     def ask(self, **request: Any) -> int:
         """Return the answer to a request."""
@@ -105,7 +121,8 @@ class ForkServer:
     def close(self) -> None:
         """End it; processes that it has started go on."""
         self._line.close()
-        self._process.wait()
+        if self._process is not None:
+            self._process.wait()
 
 
 def become(
@@ -125,17 +142,26 @@ def become(
         os.close(file)
 
 
-def serve(line: socket.socket) -> None:
-    """Fork a process or reap one at each request; return in each process, and at the end."""
-    while text := line.recv(2**20):
-        request = json.loads(text)
-        if 'reap' in request:
-            answer = os.waitstatus_to_exitcode(os.waitpid(request['reap'], 0)[1])
-        elif not (answer := os.fork()):
+def serve(its: socket.socket) -> None:
+    """Fork a process or reap one at each request, and end after the last; return in each fork."""
+    lines = [its.accept()[0]]
+    while lines:
+        line = select.select([its, *lines], [], [])[0][0]
+        if line is its:
+            lines.append(its.accept()[0])
+        elif text := line.recv(2**20):
+            request = json.loads(text)
+            if 'reap' in request:
+                answer = os.waitstatus_to_exitcode(os.waitpid(request['reap'], 0)[1])
+            elif not (answer := os.fork()):
+                for each in (its, *lines):
+                    each.close()
+                become(**request)
+                return
+            line.send(str(answer).encode())
+        else:
+            lines.remove(line)
             line.close()
-            become(**request)
-            return
-        line.send(str(answer).encode())
     # Without the cleaning up of what was only imported.
     os._exit(0)
 
