@@ -14,6 +14,8 @@ from hmsa_lab.adapt import adaptive_joint, corrections, estimator, window
 from hmsa_lab.adapt.motion import follow
 from hmsa_ros.runtime.records import Severity, StretchRequest, Trajectory
 
+pytestmark = pytest.mark.long
+
 MOVES = (1.4, 1.1, 1.4, 1.1, 1.4)
 
 
