@@ -57,7 +57,7 @@ TABLES = {
 NAMES = tuple(TABLES)
 #: The others run on request only: they take long and need the machine for themselves.
 TABLES |= {
-    'feedback': ('feedback.compare',),
+    'faults': ('faults.compare',), 'soak': ('soak.compare',), 'feedback': ('feedback.compare',),
     'identification': (
         'identification.speed', 'identification.robustness', 'identification.compare'),
     'defects': ('defects.compare',), 'harm': ('harm.compare',),
@@ -69,7 +69,7 @@ TABLES |= {
     'repeats': ('repeats.compare',), 'beam': ('beam.compare', 'beam.sequences'),
     'beam-identification': ('beam.identified',),
     'modes': ('continuum.covered', 'continuum.identified')}
-LONG = ('faults', 'soak', *list(TABLES)[len(NAMES):])
+LONG = tuple(TABLES)[len(NAMES):]
 _NEED_ROS = ('preemption', 'joints', 'controller', 'recorder', 'player', 'crash', 'feedback',
              'faults', 'soak')
 
@@ -127,8 +127,8 @@ def main(arguments: list[str] | None = None) -> int:
     sheets: list[Sheet] = []
     record: dict[str, Any] = {'machine': host}
     status = 0
-    given = {'quick': options.quick, 'minutes': options.minutes, 'picture': options.picture,
-             **({'runs': options.runs} if options.runs else {})}
+    options.runs = options.runs or None
+    given = {x: y for x, y in vars(options).items() if y is not None}
     names = [x for x in names if x not in _NEED_ROS or _has_ros(x)]
     for path in (y for x in TABLES if x in names for y in TABLES[x]):
         module, _, function = path.partition('.')
@@ -141,26 +141,11 @@ def main(arguments: list[str] | None = None) -> int:
         if not sheet.passed:
             console.print(f'{sheet.key}: not what is promised')
             status = 1
-    texts: dict[str, str] = {}
-    if 'faults' in names:
-        from benchmarks import bench_faults
-
-        outcomes, failed = bench_faults.run(console, only=options.only, quick=options.quick)
-        status = status or failed
-        record['faults'] = bench_faults.record(outcomes)
-        texts['faults'] = bench_faults.page_text(outcomes)
-    if 'soak' in names:
-        from benchmarks import bench_soak
-
-        record['soak'], texts['soak'], failed = bench_soak.run(
-            console, hours=options.hours, minutes=options.minutes, quick=options.quick,
-            factor=options.factor, rate=options.rate, picture=options.picture)
-        status = status or failed
     if options.json:
         options.json.write_text(
             json.dumps(record, indent=2, default=str) + '\n', encoding='utf-8')
     if options.page:
-        texts |= {x.key: x.markdown() for x in sheets}
+        texts = {x.key: x.markdown() for x in sheets}
         if remarks := [y for x in sheets for y in x.remarks]:
             texts['machine'] = '\n'.join([where + '.', '', *(f'* {x}' for x in remarks)])
         page = renewed(options.page.read_text(encoding='utf-8'), texts)

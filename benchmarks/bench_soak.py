@@ -32,10 +32,9 @@ import tempfile
 from time import monotonic
 from typing import Any
 
-from rich.console import Console
-
 from benchmarks.faults.memory import Sample, Trend, trend, used
 from benchmarks.measure import ros_domain
+from benchmarks.sheet import Sheet
 
 _HOUR = 3600.0
 _STEP_NS = 1_000_000
@@ -736,12 +735,10 @@ def _trend_text(found: Trend) -> str:
             f'{"flat" if found.flat else "not flat"}')
 
 
-def run(
-        console: Console, *, hours: float = 8.0, minutes: float = math.inf,
-        factor: float | None = None, rate: float = RATE, quick: bool = False,
-        picture: Path | None = None) -> tuple[dict[str, Any], str, int]:
-    """Run both parts, print the results, and return record, text and exit status."""
-    domain = ros_domain()
+def compare(
+        *, quick: bool, hours: float = 8.0, minutes: float = math.inf,
+        factor: float | None = None, rate: float = RATE, picture: Path | None = None) -> Sheet:
+    """Run both parts; passed if all requirements are met."""
     length = 300.0
     if factor is None:
         factor = FACTOR * max(RATE / rate, 1.0)
@@ -749,17 +746,13 @@ def run(
         hours, minutes, length = 0.05, 0.4, 30.0
     with tempfile.TemporaryDirectory(prefix='hmsa_soak_') as folder:
         result = run_over_dds(
-            Path(folder), domain, hours=hours, minutes=minutes, length=length,
+            Path(folder), ros_domain(), hours=hours, minutes=minutes, length=length,
             factor=factor, rate=rate)
     core = run_in_process(hours)
-    lines = report(result, core, rate)
-    for line in lines:
-        console.print(line)
     if picture is not None:
         draw(result, picture)
     failures = [*result.failures(), *core.failures()]
-    for line in failures:
-        console.print(f'FAILED: {line}')
-    record = {'over_dds': asdict(result), 'in_process': asdict(core), 'failures': failures}
-    text = '\n'.join(f'* {x}' for x in lines) + '\n'
-    return record, text, 1 if failures else 0
+    return Sheet(
+        'soak', 'Soak', (), (), {
+            'over_dds': asdict(result), 'in_process': asdict(core), 'failures': failures},
+        not failures, report(result, core, rate), [f'FAILED: {x}' for x in failures])

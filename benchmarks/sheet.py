@@ -8,12 +8,12 @@ from rich.console import Console
 from rich.table import Table
 
 # Headings of columns without numbers, besides the first one.
-_TEXT = ('setting', 'remark')
+_TEXT = ('setting', 'remark', 'how', 'expected', 'residual or loss')
 
 
 @dataclass(frozen=True)
 class Sheet:
-    """A table with its own headings."""
+    """A table with its own headings; without headings, its legend alone."""
 
     key: str  # name in the JSON file and in the marks of a page
     title: str
@@ -31,12 +31,13 @@ class Sheet:
 
     def show(self, console: Console) -> None:
         """Print the table."""
-        table = Table(title=self.title, title_justify='left')
-        for name, is_text in zip(self.head, self._texts, strict=True):
-            table.add_column(name, justify='left' if is_text else 'right')
-        for cells in self.rows:
-            table.add_row(*cells)
-        console.print(table)
+        if self.head:
+            table = Table(title=self.title, title_justify='left')
+            for name, is_text in zip(self.head, self._texts, strict=True):
+                table.add_column(name, justify='left' if is_text else 'right')
+            for cells in self.rows:
+                table.add_row(*cells)
+            console.print(table)
         for text in self.legend:
             console.print(f'* {text}', markup=False, highlight=False)
         for text in self.remarks:
@@ -44,9 +45,12 @@ class Sheet:
 
     def markdown(self) -> str:
         """Return the table for a page of the documentation."""
-        rule = ['---' if x else '--:' for x in self._texts]
-        lines = ['| ' + ' | '.join(cells) + ' |' for cells in (self.head, rule, *self.rows)]
         legend = [f'* {x}' for x in self.legend]
+        if not self.head:
+            return '\n'.join([*legend, ''])
+        rule = ['---' if x else '--:' for x in self._texts]
+        lines = ['| ' + ' | '.join(x.replace('|', '\\|') for x in cells) + ' |'
+                 for cells in (self.head, rule, *self.rows)]
         return '\n'.join([
             f'**{self.title}**', '', *legend, *[''] * bool(legend), *lines, ''])
 

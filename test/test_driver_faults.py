@@ -15,5 +15,5 @@ _FAST = (
     pytest.param(x, id=x.key, marks=() if x.key in _FAST else pytest.mark.slow)
     for x in hardware.FAULTS])
 def test_the_coil_is_off_or_the_truth_is_said(fault, ros_domain_id):
-    seen = inject(fault, ros_domain_id).seen
+    seen = inject(fault, ros_domain_id)
     assert seen.met, f'expected {fault.expected}; seen {seen.text} ({seen.figure})'

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from benchmarks import __main__ as program
-from benchmarks import bench_soak
+from benchmarks import bench_faults, bench_soak
 from benchmarks.faults import memory, rows
 from benchmarks.faults.rig import Rig, settled
-from benchmarks.faults.table import inject, markdown, Outcome, Seen
+from benchmarks.faults.table import inject, Seen
 from hmsa.bag.writer import BagTopic, BagWriter
 
 MIB = 2**20
@@ -26,7 +26,7 @@ MIB = 2**20
 @pytest.mark.parametrize('fault', [
     pytest.param(x, id=x.key) for x in rows.FAULTS if x.key in rows.QUICK])
 def test_fault_is_answered_as_expected(fault, ros_domain_id):
-    seen = inject(fault, ros_domain_id).seen
+    seen = inject(fault, ros_domain_id)
     assert seen.met, f'expected {fault.expected}; seen {seen.text} ({seen.figure})'
 
 
@@ -65,16 +65,18 @@ def test_a_row_that_is_not_met_fails_the_run(ros_domain_id, monkeypatch, tmp_pat
     page.write_text('<!-- begin faults -->\n<!-- end faults -->\n')
     assert program.main(['faults', '--page', str(page), '--json', str(file)]) == 1
     assert '**not met**' in page.read_text()
-    assert json.loads(file.read_text())['faults'][0]['met'] is False
-    assert 'NOT MET' in capfd.readouterr().out
+    assert json.loads(file.read_text())['faults']['figures']['rows'][0]['met'] is False
+    out, err = capfd.readouterr()
+    assert '0 of 1 as expected; not: wrong' in out
+    assert 'NOT MET' in err
 
 
 def test_table_says_what_was_expected_beside_what_was_seen():
     fault = rows.FAULTS[0]
-    text = markdown([
-        Outcome(fault, Seen('a | b', '1e-9', met=True)),
-        Outcome(fault, Seen('a | b', '1e-9', met=False))])
-    head, _, met, missed = text.splitlines()
+    sheet = bench_faults.sheet([fault] * 2, [
+        Seen('a | b', '1e-9', met=True), Seen('a | b', '1e-9', met=False)])
+    assert not sheet.passed
+    *_, head, _, met, missed = sheet.markdown().splitlines()
     assert head.count('|') == 5
     assert met.endswith(f'| {fault.expected} | 1e-9 |')
     assert missed.endswith(f'| {fault.expected}; **not met**: a \\| b | 1e-9 |')

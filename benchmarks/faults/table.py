@@ -1,6 +1,6 @@
-"""The table of faults: one row per fault, with the expected and the actual response."""
+"""A fault, with the expected and the actual response, and its injection."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 import tempfile
@@ -29,15 +29,7 @@ class Fault:
     inject: Callable[[Rig], Seen]  # injects it in a rig of its own
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """A row of the table."""
-
-    fault: Fault
-    seen: Seen
-
-
-def inject(fault: Fault, domain: int) -> Outcome:
+def inject(fault: Fault, domain: int) -> Seen:
     """
     Inject one fault into real processes of a ROS domain.
 
@@ -56,16 +48,4 @@ def inject(fault: Fault, domain: int) -> Outcome:
             seen = Seen(
                 f'{seen.text}; {len(traces)} unhandled exceptions, the first in the {traces[0]}',
                 seen.figure, met=False)
-    return Outcome(fault, seen)
-
-
-def markdown(outcomes: Sequence[Outcome]) -> str:
-    """Return the table for a documentation page; the response is shown only if unexpected."""
-    head = ('fault', 'how', 'expected', 'residual or loss')
-    lines = ['| ' + ' | '.join(head) + ' |', '|' + ' --- |' * len(head)]
-    for row in outcomes:
-        expected = row.fault.expected + (
-            '' if row.seen.met else f'; **not met**: {row.seen.text}')
-        cells = (row.fault.name, row.fault.how, expected, row.seen.figure)
-        lines.append('| ' + ' | '.join(x.replace('|', '\\|') for x in cells) + ' |')
-    return '\n'.join(lines) + '\n'
+    return seen
