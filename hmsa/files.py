@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+import csv
 import json
 import math
 import os
@@ -43,6 +44,12 @@ def replacing(path: Path) -> Iterator[Path]:
         raise BadInputError(
             f'cannot write {path}: {error.strerror or error}; expected a folder with write '
             'permission and room') from error
+
+
+def write_rows(path: Path, rows: Iterable[Iterable[object]]) -> None:
+    """Write rows as CSV in UTF-8, numbers in full precision, or change nothing."""
+    with replacing(path) as beside, beside.open('w', newline='', encoding='utf-8') as file:
+        csv.writer(file, lineterminator='\n').writerows(rows)
 
 
 def write_text(path: Path, text: str) -> None:

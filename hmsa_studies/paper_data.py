@@ -6,14 +6,14 @@ with the sign of the field. Constants here define parameters that the paper does
 """
 
 from collections.abc import Iterator, Sequence
-import csv
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 
-from hmsa.files import replacing
+from hmsa.files import write_rows
 from hmsa.model.equations import Array, critical_zeta, signed_root, stretch_limits
 from hmsa.model.moves import Setpoint
 from hmsa.model.parameters import NondimensionalParameters
@@ -209,20 +209,15 @@ _SWEEP_COLUMNS = (
 
 def write_csv(path: Path, data: Data) -> None:
     """Write a figure's data in full precision, by rows; loads apply from their time on."""
-    with replacing(path) as beside, beside.open('w', newline='', encoding='utf-8') as file:
-        writer = csv.writer(file, lineterminator='\n')
-        if isinstance(data, PaperSweep):
-            writer.writerow(_SWEEP_COLUMNS)
-            writer.writerows(_rows(
-                data.zeta, data.j_lim, data.tau_p, signed_root(data.beta_p),
-                signed_root(data.beta_1), data.beta_p, data.beta_1, data.status,
-                fixed=(data.start, data.target)))
-            return
-        writer.writerow(_RUN_COLUMNS)
-        for run in data:
-            writer.writerows(_rows(
-                run.time, signed_root(run.load), run.load, run.stretch, run.rate,
-                fixed=(run.name, run.command, run.material.zeta, run.material.j_lim)))
+    if isinstance(data, PaperSweep):
+        write_rows(path, [_SWEEP_COLUMNS, *_rows(
+            data.zeta, data.j_lim, data.tau_p, signed_root(data.beta_p),
+            signed_root(data.beta_1), data.beta_p, data.beta_1, data.status,
+            fixed=(data.start, data.target))])
+        return
+    write_rows(path, [_RUN_COLUMNS, *chain.from_iterable(_rows(
+        run.time, signed_root(run.load), run.load, run.stretch, run.rate,
+        fixed=(run.name, run.command, run.material.zeta, run.material.j_lim)) for run in data)])
 
 
 def _rows(

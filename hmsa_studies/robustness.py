@@ -6,7 +6,6 @@ in shear modulus G, damping coefficient and J_lim, each alone and all together a
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-import csv
 from dataclasses import dataclass, field
 from itertools import product
 import math
@@ -16,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from hmsa.errors import BadInputError, check_number, HmsaError
-from hmsa.files import replacing
+from hmsa.files import write_rows
 from hmsa.model.delivery import Delivery, IDEAL
 from hmsa.model.equations import Array
 from hmsa.model.moves import Level, Limits, Move, State
@@ -231,12 +230,8 @@ _COLUMNS = (
 
 def write_csv(path: Path, studies: Sequence[tuple[Case, Sequence[Result]]]) -> None:
     """Write all residuals, one per row, in full double precision; replace an old file."""
-    with replacing(path) as beside, beside.open('w', newline='', encoding='utf-8') as file:
-        writer = csv.writer(file, lineterminator='\n')
-        writer.writerow(_COLUMNS)
-        for case, results in studies:
-            for result in results:
-                writer.writerows(_rows(case, result))
+    write_rows(path, [_COLUMNS, *(
+        row for case, results in studies for result in results for row in _rows(case, result))])
 
 
 def _rows(case: Case, result: Result) -> Iterator[tuple[str | float, ...]]:

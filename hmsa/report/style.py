@@ -7,7 +7,6 @@ no influence and does not change, and the same data always produce the same byte
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-import csv
 import io
 import itertools
 from pathlib import Path
@@ -29,7 +28,7 @@ from matplotlib.ticker import (
 )
 import numpy as np
 
-from hmsa.files import replacing
+from hmsa.files import replacing, write_rows
 from hmsa.report import looks
 from hmsa.report.figures import Axis, Curve, Panel
 from hmsa.report.looks import INCH, kind_of, Paper
@@ -134,12 +133,9 @@ def picture(
                 else:
                     figure.savefig(beside, format=kind, metadata=_METADATA[kind])
         for path in paper.tables(paths):
-            with replacing(path) as beside, beside.open('w', newline='', encoding='utf-8') as file:
-                rows = list(figure.rows())
-                writer = csv.writer(file, lineterminator='\n')
-                size = max((len(x) for x in rows), default=len(_COLUMNS))
-                writer.writerow((*_COLUMNS, 'z')[:size])
-                writer.writerows(rows)
+            rows = list(figure.rows())
+            size = max((len(x) for x in rows), default=len(_COLUMNS))
+            write_rows(path, [(*_COLUMNS, 'z')[:size], *rows])
 
 
 def axis(quantity: str, symbol: str = '', unit: str = '') -> str:
