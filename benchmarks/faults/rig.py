@@ -3,7 +3,7 @@
 from array import array
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-import ctypes
+from functools import partial
 import os
 from pathlib import Path
 import signal
@@ -24,6 +24,7 @@ from std_msgs.msg import Float64
 from hmsa.errors import HmsaError
 from hmsa.interfaces import topics
 from hmsa.model.units import NANOSECONDS
+from hmsa_ros.clients.processes import die_with_parent
 from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.conversions import from_time, to_trajectory
 
@@ -33,7 +34,6 @@ PATIENCE = 40.0
 _SLICE = 0.02
 # Time a server needs to discover a new client, in s.
 _ACQUAINTANCE = 0.2
-_PR_SET_PDEATHSIG = 1
 _TRACE = 'Traceback (most recent call last)'
 # Number of log lines quoted for a failure.
 _LAST = 4
@@ -50,7 +50,8 @@ class Child:
             self.popen = subprocess.Popen(
                 command, cwd=ROOT, env=dict(environment), stdin=subprocess.DEVNULL,
                 stdout=file, stderr=file,
-                preexec_fn=_die_with_parent)  # noqa: PLW1509 - only calls the kernel
+                preexec_fn=partial(  # noqa: PLW1509 - only calls the kernel
+                    die_with_parent, signal.SIGKILL))
 
     @property
     def alive(self) -> bool:
@@ -75,12 +76,6 @@ class Child:
         except subprocess.TimeoutExpired:
             self.popen.kill()
             return self.popen.wait()
-
-
-def _die_with_parent() -> None:
-    """Make the kernel end this process with its parent, and respond to SIGINT."""
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 class Rig:

@@ -75,7 +75,7 @@ class Session:
             self._processes[node.name] = subprocess.Popen(
                 node.command(), stdin=subprocess.DEVNULL, stdout=log, stderr=log,
                 start_new_session=True,
-                preexec_fn=_die_with_parent)  # noqa: PLW1509 - only calls the kernel
+                preexec_fn=die_with_parent)  # noqa: PLW1509 - only calls the kernel
 
     def log(self, name: str) -> Path:
         """Return the log file of a node."""
@@ -120,11 +120,11 @@ class Session:
         return {name: self._processes[name].returncode for name in names}
 
 
-def _die_with_parent() -> None:
-    """Have the kernel interrupt this process when its parent has ended."""
+def die_with_parent(number: int = signal.SIGINT) -> None:
+    """Have the kernel send this process a signal when its parent has ended."""
     # A shell may start background jobs with SIGINT ignored.
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGINT)
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, number)
 
 
 def stay_local() -> None:
