@@ -92,7 +92,7 @@ def test_a_coil_that_is_too_warm_is_switched_off_and_refused_until_it_has_cooled
     def at(seconds, level=None):
         clock[0] = seconds
         now = START + round(seconds * 1e9)
-        if device.cut_offs:
+        if any(x.is_cut_off for x in device.guards):
             device.receive(0, device.guards[0].cut_off_time, 0.0)
         if level is not None:
             device.receive(0, now, level)

@@ -868,7 +868,7 @@ def test_a_worker_that_is_to_reconnect_goes_on_from_zero_once_the_cable_is_in_ag
         wait_until(lambda: 'the coil is switched off, and all' in worker.trouble, 'the off')
         # Time enough for a planner to hear of it; then 0 T comes first.
         wait_until(lambda: worker.look_after() or not worker.trouble, 'the end of it')
-        assert worker.device.cut_offs == [0, 1]
+        assert [x.is_cut_off for x in worker.device.guards] == [True, True]
         for level in (0.15, 0.0, 0.12):
             worker.receive(0, 0, level)
         wait_until(lambda: cable.levels[-1] == 0.12, 'a new level')

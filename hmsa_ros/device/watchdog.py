@@ -372,11 +372,6 @@ class Device(ABC):
         """Number of excessive silences, summed over the joints."""
         return sum(x.trips for x in self.guards)
 
-    @property
-    def cut_offs(self) -> list[int]:
-        """Numbers of the joints that reject levels until a cut-off is acknowledged."""
-        return [x.number for x in self.guards if x.is_cut_off]
-
     def _check_clock(self, stamp: int) -> None:
         """Refuse a timestamp in ns of a clock with a different epoch."""
         if stamp and self.time and abs(stamp - self.time) > ANOTHER_CLOCK:

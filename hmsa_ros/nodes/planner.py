@@ -34,7 +34,6 @@ from hmsa_ros.nodes.markers import TargetMarkers
 from hmsa_ros.nodes.parameters import declare_joints
 from hmsa_ros.nodes.planning import group_from, models_from, OWN, settings_from, SPECS
 from hmsa_ros.runtime import records
-from hmsa_ros.runtime.records import Environment, ObservedSample, Send, StretchRequest
 from hmsa_ros.runtime.runtime import Runtime
 from hmsa_ros.runtime.worker import PlanningThread
 from hmsa_ros.timekeeping import steady_ns, StepWatch, Throttle
@@ -96,7 +95,7 @@ class JointChannel:
                 self._node, topics.of_joint(topics.TEMPERATURE, self._joint, self._names),
                 self._on_temperature)
 
-    def publish_command(self, command: Send, frame: str) -> None:
+    def publish_command(self, command: records.Send, frame: str) -> None:
         """Publish a command in the frame of the coil."""
         self._command.publish(
             conversions.to_command(command.stamp, command.flux_density, frame))
@@ -139,7 +138,7 @@ class JointChannel:
         return ''
 
     def _on_setpoint(self, message: Float64) -> None:
-        self._runtime.request(StretchRequest(self._joint, message.data))
+        self._runtime.request(records.StretchRequest(self._joint, message.data))
         self._serve()
 
     def _on_temperature(self, message: Temperature) -> None:
@@ -203,7 +202,7 @@ class PlannerNode(ManagedNode):
 
     def _new_runtime(self) -> Runtime:
         runtime = Runtime(
-            group_from(self._settings), settings_from(self._settings), Environment(
+            group_from(self._settings), settings_from(self._settings), records.Environment(
                 self.now, worker=self._worker, one_clock=self._one_clock,
                 observable=self._observable, unheard=self._unheard,
                 found=lambda joint: self._channels[joint].found,
@@ -345,7 +344,7 @@ class PlannerNode(ManagedNode):
         """Return the age of a received message in ns, by the node's clock."""
         return 0 if self._one_clock() else max(time_ns() - taken.received_ns, 0)
 
-    def _glance(self) -> Iterator[tuple[str, ObservedSample]]:
+    def _glance(self) -> Iterator[tuple[str, records.ObservedSample]]:
         """Yield the newest samples, if any, without decoding all of them."""
         missing = set(self._channels)
         for taken in reversed([] if self._newest is None else self._newest.take()):
@@ -357,7 +356,7 @@ class PlannerNode(ManagedNode):
                     if name in missing:
                         missing.discard(name)
                         ago = self._ago(taken)
-                        yield name, ObservedSample(
+                        yield name, records.ObservedSample(
                             stamp, stretch, rate, flux_density,
                             None if self._one_clock() else self.now() - ago - stamp,
                             self._runtime.environment.steady() - ago)
