@@ -372,6 +372,23 @@ def test_judging_several_joints_does_not_keep_commands_waiting(monkeypatch):
     assert len(set(judged)) == len(judged)
 
 
+@pytest.mark.parametrize('spacing', [120, 160])
+def test_a_planner_whose_ticks_take_as_long_as_an_estimate_judges_all_the_same(spacing):
+    loop = Loop(noise=1e-4, lead=400 * MS, feedback='adapt')
+    tick, ticks = loop.runtime.tick, []
+
+    def seldom(now):
+        if ticks and now < ticks[-1] + spacing * MS:
+            return []
+        ticks.append(now)
+        return tick(now)
+
+    loop.runtime.tick = seldom
+    loop.run((1.2, 500 * MS), (1.1, 500 * MS), (1.3, 500 * MS))
+    assert loop.status.verdict.code == 'arrived'
+    assert not loop.status.watching
+
+
 def test_a_setpoint_that_a_plan_comes_back_to_is_not_missed():
     setpoint = RequestedSetpoint(1.2, 1.0, START, START + 10 * MS, None, 600.0, 30.0)
     hold = setpoint_samples.SetpointSamples(replace(setpoint, held=True))

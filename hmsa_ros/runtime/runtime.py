@@ -111,6 +111,7 @@ class Runtime:
         self._last_jump: int | None = None
         self._set_back = 0
         self._differ = False  # whether a clock offset was reported
+        self._put_off = False  # whether the last tick left judging to the next one
         self._impossible_due = Throttle()
 
     def _follow(self) -> None:
@@ -511,7 +512,9 @@ class Runtime:
                 self._watch.open or self._reporting.unheard or self._reporting.unseen
                 or self.devices.receipts or self._reporting.next_change is not None):
             self._reporting.look_for_listeners()
-            if not estimated:
+            # Where a tick takes as long as an update, updates end in every tick.
+            self._put_off = estimated and not self._put_off
+            if not self._put_off:
                 self._judge(now)
         if (verdict := self._stops.look(now)) is not None:
             self._reporting.give(verdict, log=verdict.severity > Severity.OK)
