@@ -171,6 +171,11 @@ def test_the_peak_and_the_trough_of_two_modes_may_be_periods_apart(seed):
     assert verdict_of(draw(seed, 'both')) != 'arrived'
 
 
+def test_what_noise_may_hide_beside_two_modes_is_undecided():
+    # Together 1.03 tolerances, in noise of a fifth of one.
+    assert verdict_of(draw(61225, 'both')) == 'undecided'
+
+
 def test_modes_that_noise_hides_together_are_not_taken_for_rest():
     modes = (1.0, 0.98, 0.022), (1.0, 3.19, 0.022), (1.4, 5.77, 0.022)
     assert np.ptp(ringing(*modes, noise=0.0, seconds=0.07)[1]) > 0.02 * STEP

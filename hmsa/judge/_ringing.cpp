@@ -1052,10 +1052,12 @@ Found fit(const Array &time, const Array &values, const Settings &settings)
     }
     Bounded &vibration = found.vibration, &offset = found.offset;
     const double gone = 0.5 / (few_samples * problem.interval * settings.frequency);
-    // Two modes may hide, in noise that is not the same.
-    vibration.high = std::max(
-        vibration.high, (vibration.low > 0.0 ? vibration.value : 0.0) + std::sqrt(2.0)
-            * rest.hidden(settings, std::min(hidden_decay, gone)));
+    // Two modes may hide, in noise that is not the same, nor that of several modes that are shown.
+    const double shown = vibration.low > 0.0 ? vibration.value : 0.0,
+                 error = vibration.high - shown,
+                 hidden = std::sqrt(2.0) * rest.hidden(settings, std::min(hidden_decay, gone));
+    vibration.high = shown + (problem.modes.empty() ? std::max(error, hidden)
+                                                    : std::hypot(error, hidden));
     // What samples show themselves, whatever rings: frequencies may change with the amplitude.
     const double between = problem.interval * found.resolved,
                  seen = largest(time.data(), values.data(), base.count(), 0.0, problem.period);
