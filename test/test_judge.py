@@ -7,7 +7,7 @@ import pytest
 from scipy.special import stdtrit
 
 from benchmarks.bench_judge import draw, verdict_of
-from hmsa.judge.fit import student_quantile
+from hmsa.judge.fit import fit, student_quantile
 from hmsa.judge.judging import judge
 from hmsa.judge.records import missed, RequestedSetpoint, SensorModel, Tolerances, worst
 
@@ -77,6 +77,15 @@ def test_a_second_mode_rings_at_its_own_frequency(ratio, first):
     assert found.vibration == pytest.approx(most, rel=0.1)
     quiet = ringing((1.0, ratio, 0.005), (0.3, 0.95, 0.02), noise=0.1)
     assert judge(*quiet, setpoint(end=200 * MS)).arrived
+
+
+@pytest.mark.parametrize('phase', [0.0, 1.0, 2.5, 4.0])
+@pytest.mark.parametrize('damping', [0.0, 0.03, 0.1])
+def test_the_size_of_a_vibration_is_that_of_its_extrema(phase, damping):
+    time = np.arange(0.0, 0.1, 1e-4)
+    wave = 1e-2 * np.exp(-damping * OMEGA * time) * np.cos(OMEGA * time + phase)
+    found = fit(time, wave, OMEGA, DECAY)
+    assert found.vibration.value == pytest.approx(np.ptp(wave), rel=1e-3)
 
 
 def test_several_modes_are_named_largest_first():

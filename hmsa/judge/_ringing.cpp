@@ -62,8 +62,7 @@ constexpr int fitted = 6, fitted_mode = 4;
 // Phase between samples, at the highest frequency, below which they show the range of a motion, and
 // the range of normal noise in a period in standard deviations.
 constexpr double close_to = 1.5, peaks = 7.0;
-// Phases at which a vibration is evaluated, and maximum number of possible fits.
-constexpr int phases = 32;
+// Maximum number of possible fits, of one sinusoid and of several.
 constexpr size_t most_possible = 200, most_summed = 24;
 // Ratio of standard deviation to median absolute deviation of normal noise.
 constexpr double normal = 1.4826;
@@ -640,24 +639,26 @@ double swing_of(const std::vector<Wave> &waves, const Array &times, double *cont
         contrast[0] = times[size_t(low - sum.begin())];
         contrast[1] = times[size_t(high - sum.begin())];
     }
-    return *high - *low;
+    // Extrema of the parabolas through these and their neighbours.
+    const auto extremum = [&](Array::const_iterator x) {
+        if (x == sum.begin() || x + 1 == sum.end()) {
+            return *x;
+        }
+        const double bend = x[-1] - 2.0 * x[0] + x[1];
+        return bend == 0.0 ? *x : *x - 0.125 * square(x[1] - x[-1]) / bend;
+    };
+    return extremum(high) - extremum(low);
 }
 
-// Peak to peak of a wave in its first period.
+// Peak to peak of a wave in its first period: from its begin or its second extremum to the first.
 double swing_of(const Wave &wave)
 {
-    constexpr double step = 2.0 * pi / (phases - 1);
-    static const double turn_real = std::cos(step), turn_imaginary = std::sin(step);
-    const double size = std::exp(-wave.decay / wave.omega * step);
-    double low = infinity, high = -infinity, cosine = wave.cosine, sine = wave.sine;
-    for (int i = 0; i < phases; ++i) {
-        low = std::min(low, cosine);
-        high = std::max(high, cosine);
-        const double next = size * (cosine * turn_real + sine * turn_imaginary);
-        sine = size * (sine * turn_real - cosine * turn_imaginary);
-        cosine = next;
-    }
-    return high - low;
+    const double ratio = wave.decay / wave.omega, lag = std::atan(ratio),
+                 from = std::atan2(wave.sine, wave.cosine), number = std::ceil((lag - from) / pi),
+                 first = std::hypot(wave.cosine, wave.sine) * std::cos(lag)
+                     * std::exp(-ratio * (number * pi - lag + from));
+    return first + std::max(first * std::exp(-pi * ratio),
+                            std::fmod(number, 2.0) == 0.0 ? -wave.cosine : wave.cosine);
 }
 
 // Deviation of a swing for unit deviation of the coefficients: the maximum over all phases.
