@@ -185,6 +185,12 @@ def test_what_noise_may_hide_beside_two_modes_is_undecided():
     assert verdict_of(draw(61225, 'both')) == 'undecided'
 
 
+@pytest.mark.parametrize('seed', [50095, 50227, 50334, 50580])
+def test_what_the_rounding_of_a_sensor_may_decide_is_undecided(seed):
+    # At rest 0.95 to 1.3 tolerances off, and rounded by 0.13 to 1.1 of one.
+    assert verdict_of(draw(seed, 'quantised')) == 'undecided'
+
+
 def test_modes_that_noise_hides_together_are_not_taken_for_rest():
     modes = (1.0, 0.98, 0.022), (1.0, 3.19, 0.022), (1.4, 5.77, 0.022)
     assert np.ptp(ringing(*modes, noise=0.0, seconds=0.07)[1]) > 0.02 * STEP

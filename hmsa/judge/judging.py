@@ -115,7 +115,7 @@ def _judged(
         last = int(np.searchsorted(stamps, setpoint.end, 'right'))
     if first >= last:
         return unobserved(setpoint)
-    every = stamps[first:last], values[first:last]
+    usable, every = values, (stamps[first:last], values[first:last])
     stamps, values = _thinned(*every, begin, setpoint)
     allowed, swing = tolerances.of(setpoint)
     least = min(allowed, swing)
@@ -154,11 +154,12 @@ def _judged(
         return replace(found, verdict=Code.UNDECIDED, message=(
             f'{found.message}, but nothing moves by more than {setpoint.words(most)}: it does not '
             'ring like an actuator'))
-    if found.verdict is Code.VIBRATING:
-        step = _rounded_to(every[1])
-        if found.vibration - step <= swing:
-            return replace(found, verdict=Code.UNDECIDED, message=(
-                f'{found.message}, but the sensor rounds to {setpoint.words(step)}'))
+    step = (_rounded_to(every[1]) if found.verdict is Code.VIBRATING
+            else _rounded_to(usable, _FEW_CHANGES))
+    if step and _may_be_rounding(
+            found, step, math.sqrt(len(every[0]) / len(stamps)) * found.noise, allowed, swing):
+        return replace(found, verdict=Code.UNDECIDED, message=(
+            f'{found.message}, but the sensor rounds to {setpoint.words(step)}'))
     if not found.arrived:
         return found
     # Of many samples in a period the range of the noise is larger.
@@ -233,7 +234,7 @@ def _frozen(values: Array, setpoint: RequestedSetpoint) -> str:
     before = changes[:moved[-1] + 1][-FEWEST:]
     # A motion that fades becomes ever slower, and a sensor that rounds moves by whole steps.
     step = float(np.min(changes[moved]))
-    rounds = np.all(np.abs(changes[moved] / step - np.round(changes[moved] / step)) < 0.01)
+    rounds = _whole(changes[moved] / step)
     # And one that ends where it was to end, as in a simulation without noise, is at rest there.
     ends = abs(float(values[-1]) - setpoint.target) < _FADED * setpoint.step
     if rounds or ends or np.median(before) < _FADED * setpoint.step:
@@ -241,13 +242,37 @@ def _frozen(values: Array, setpoint: RequestedSetpoint) -> str:
     return f'{words}: it is frozen'
 
 
-def _rounded_to(values: Array) -> float:
-    """Return the step to which a sensor rounds; 0 if it does not."""
+def _rounded_to(values: Array, fewest: int = 1) -> float:
+    """Return the step to which a sensor rounds by its changes; 0 if it does not."""
     shown = np.unique(values)
     steps = np.diff(shown)
     # Steps of which rounding errors of the conversion are no part.
     steps = steps[steps > 1e-6 * np.ptp(shown)] if len(shown) > 1 else steps
-    return float(np.min(steps)) if len(steps) and _REPEATED * len(shown) < len(values) else 0.0
+    if len(steps) < fewest or _REPEATED * len(shown) >= len(values):
+        return 0.0
+    step = float(np.min(steps))
+    return step if _whole(steps / step) else 0.0
+
+
+def _whole(numbers: Array) -> bool:
+    """Return whether numbers are close to integers."""
+    return bool(np.all(np.abs(numbers - np.round(numbers)) < 0.01))
+
+
+def _may_be_rounding(
+        found: Finding, step: float, noise: float, allowed: float, swing: float) -> bool:
+    """Return whether a verdict may be due to a sensor that rounds to steps."""
+    if found.verdict is Code.VIBRATING:
+        return found.vibration - step <= swing
+    # Noise of a sample averages rounding: by the first harmonic of its error.
+    share = max((noise / step)**2 - 1.0 / 12.0, 0.0)
+    error = 0.5 * step * math.exp(-2.0 * math.pi**2 * share)
+    if found.verdict is Code.OFF_TARGET:
+        return abs(found.offset) - error <= allowed
+    # A vibration that crosses steps shows its size.
+    hidden = 2.0 * error if found.vibration < step else 0.0
+    return found.arrived and (
+        abs(found.offset) + error > allowed or found.vibration + hidden > swing)
 
 
 def _thinned(
