@@ -495,7 +495,7 @@ struct Settings {
 
 struct Found {
     Bounded offset, vibration;
-    double noise, usual, independent, unexplained, resolved;
+    double noise, usual, independent, resolved;
     std::vector<Wave> waves;  // largest first
     Array swings;
 };
@@ -531,20 +531,25 @@ struct Problem {
         range.high = std::min(
             range.high, dense ? 0.9 * pi / interval : range.low + 2.0 * pi / interval);
         omegas = std::max(int((range.high - range.low) * span * tried / (2.0 * pi)), refined);
-        range.decay = std::min({
+        fade(std::min({
             std::max(faster * s.decay, least_decay * s.frequency), most_decay * s.frequency,
-            longest / std::max(t.front(), interval)});
-        for (double x : decays) {
-            faded.push_back(x * range.decay);
-        }
+            longest / std::max(t.front(), interval)}));
         range.width = (range.high - range.low) / (omegas - 1);
-        range.spread = faded[1];
         searched = 2.0 * std::log(std::max((range.high - range.low) * span / (2.0 * pi), 1.0));
     }
 
     Base base() const { return base(creep); }
     // Offset, drift or creep with a time constant, and the modes found.
     Base base(double creep) const
+    {
+        Base found = bare(creep);
+        for (const Wave &mode : modes) {
+            found.add_wave(mode.omega, mode.decay);
+        }
+        return found;
+    }
+    // The same without the modes.
+    Base bare(double creep) const
     {
         Base found(time, values);
         if (creep > 0.0 || periods >= drifts_from) {
@@ -556,10 +561,17 @@ struct Problem {
             }
             found.add_drift(std::move(drift));
         }
-        for (const Wave &mode : modes) {
-            found.add_wave(mode.omega, mode.decay);
-        }
         return found;
+    }
+    // Try decays up to the largest one.
+    void fade(double most)
+    {
+        range.decay = most;
+        faded.clear();
+        for (double x : decays) {
+            faded.push_back(x * most);
+        }
+        range.spread = faded[1];
     }
     // Search near a mode, found as one of several, in place of the frequency of the model.
     void look_near(size_t number)
@@ -570,13 +582,7 @@ struct Problem {
         range.high = omega + line;
         omegas = 4 * tried + 1;
         range.width = (range.high - range.low) / (omegas - 1);
-        range.decay = std::min(2.0 * mode_damped * omega, longest / std::max(
-            time.front(), interval));
-        faded.clear();
-        for (double x : decays) {
-            faded.push_back(x * range.decay);
-        }
-        range.spread = faded[1];
+        fade(std::min(2.0 * mode_damped * omega, longest / std::max(time.front(), interval)));
         searched = 2.0 * std::log(std::max((top() - range.low) * span / (2.0 * pi), 1.0));
     }
     void coarse(const Base &from, int number, Fits &fits) const
@@ -667,9 +673,7 @@ double factor_of(const Wave &wave) { return 1.0 + std::exp(-pi * wave.decay / wa
 double deviation_of_sum(const Problem &problem, double creep, const std::vector<Wave> &waves,
                         const double *contrast)
 {
-    Problem bare = problem;
-    bare.modes.clear();
-    Base base = bare.base(creep);
+    Base base = problem.bare(creep);
     Array of(base.columns.size(), 0.0);
     for (size_t k = 0; k < waves.size(); ++k) {
         const Wave &x = waves[k];
@@ -804,11 +808,9 @@ Found bounds(const Problem &problem, const std::vector<Base> &bases, const Array
 // return what is fitted then.
 Base polish(const Problem &problem, std::vector<Wave> &waves)
 {
-    Problem bare = problem;
-    bare.modes.clear();
     std::vector<Wave> now = waves;
     const auto fitted_to = [&]() {
-        Base base = bare.base();
+        Base base = problem.bare(problem.creep);
         for (const Wave &x : now) {
             base.add_wave(x.omega, x.decay);
         }

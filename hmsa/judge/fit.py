@@ -80,13 +80,3 @@ def _fit(
     if found is None:
         return None
     return VibrationFit(BoundedValue(*found[0]), BoundedValue(*found[1]), *found[2:])
-
-
-def student_quantile(freedom: float, probability: float) -> float:
-    """
-    Return the quantile of Student's t at a probability above 0.5.
-
-    Degrees of freedom, at least 1, are rounded down below 3. The expansion is 26.7.5 of Abramowitz
-    and Stegun. SciPy provides the quantile, but takes as long to import as a planner to start.
-    """
-    return _ringing.quantile(freedom, probability, NormalDist().inv_cdf(probability))
