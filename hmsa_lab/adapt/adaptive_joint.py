@@ -134,7 +134,7 @@ class AdaptiveJoint:
             self.prior.covariance[place, place]) if place >= 0 else 0.0
         self.estimator = Estimator(self.prior, EstimatorOptions(
             slew_limit=given.options.slew_limit, learn=not settings.feedback_frozen))
-        self.trust = Trust(begun, at_once=settings.cautious)
+        self.trust = Trust(begun)
         self.start = given.actuator.rest
 
     @property
@@ -317,7 +317,8 @@ class AdaptiveJoint:
         acted = trust.acts
         if trust.doubt(
                 trouble, now, used=not self.sensor_changed, fitted=self._fitted > 0
-        ) if trouble else found is not None and trust.fits(plan, self.unit, estimator, now):
+        ) if trouble else found is not None and trust.fits(
+                plan, self.unit, estimator, now, waits=now < self.waits):
             if acted:
                 self._tried.clear()
             # Samples that an estimate in use has fitted do not show what has changed since.
