@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 
 import numpy as np
 import pytest
@@ -56,6 +57,33 @@ def test_a_sine_of_the_field_is_not_what_a_sine_of_the_stretch_needs(share, opti
         plain = 2.0 * np.abs(np.fft.rfft(moved(
             levels.tolist(), 4.0 / frequency + np.arange(384) / (64.0 * frequency)) - 1.0)) / 384
         assert plain[12::6].max() > PURE * AMPLITUDE
+
+
+@pytest.mark.parametrize(('share', 'path', 'end'), [
+    (0.2, 3e-4, 1e-4), (0.5, 4e-3, 1e-3), (0.7, 0.03, 0.02)])
+def test_a_wave_of_a_continuum_is_that_of_all_its_modes(share, path, end):
+    block = Actuator(damping_ratio=0.03, mount='free', half_thickness=4e-3)
+    frequency = share * block.scales.frequency
+    plan = block.wave('sine', frequency, AMPLITUDE, cycles=16.0)
+    motion = plan.simulate(rate=40.0 * frequency)
+    steady = np.abs(motion.times * frequency - 10.0) < 2.0
+    angle = 2.0 * np.pi * frequency * motion.times[steady]
+    terms = np.column_stack([np.ones(len(angle)), np.sin(angle), np.cos(angle)])
+    found, *_ = np.linalg.lstsq(terms, motion.stretches[steady], rcond=None)
+    # It is 0.99, 0.93 and 0.86 if the path of the first mode is that of the stretch.
+    assert np.hypot(*found[1:]) == pytest.approx(AMPLITUDE, rel=3e-3)
+    after = motion.stretches[motion.times > plan.move_times[-1]]
+    assert np.ptp(after) < end * AMPLITUDE
+    assert any('secondary modes' in x for x in plan.segments[0].notes()) is (share > 0.2)
+    wanted = 1.0 + AMPLITUDE * np.sin(angle)
+    assert np.abs(motion.stretches[steady] - wanted).max() < path * AMPLITUDE
+
+
+def test_what_the_modes_of_a_continuum_leave_of_a_wave_is_told():
+    block = Actuator(damping_ratio=0.03, mount='free', half_thickness=4e-3)
+    told, = block.wave('sine', 1.5 * block.scales.frequency, 0.02).segments[0].notes()
+    assert float(re.search(r'\((\d+) % of its range\)', told)[1]) > 30.0
+    assert 'the limit is its secondary modes' in told
 
 
 def test_a_triangle_and_a_period_of_ones_own_are_followed_about_a_mean():

@@ -7,6 +7,9 @@ the error of the stretch follows from the error of this double integral. The lev
 those whose spline is nearest, in the mean square, to the double integral of the load (of the
 amplifier output if the field lags). They are as long as the tolerance allows. The last ones are
 corrected to end exactly at rest.
+
+This inverts the first mode. If the actuator has secondary modes, what all modes together leave is
+added to the path of the first one, and the levels are computed again, for as long as that helps.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,8 +24,16 @@ from hmsa import motion
 from hmsa.model import law
 from hmsa.model.equations import Array
 from hmsa.model.moves import Level, Move, State
-from hmsa.model.simulation import branches_of, follow, held_along, loads_for, sampled
+from hmsa.model.simulation import (
+    branches_of,
+    follow,
+    held_along,
+    loads_for,
+    observed,
+    sampled,
+)
 from hmsa.model.status import Code, RefusedError
+from hmsa.planning.sequence import TOLD
 from hmsa.planning.shapers.request import MoveRequest
 from hmsa.planning.shapers.two_step import two_step
 from hmsa.planning.shooting import Attempt, solve, Template, within_limits
@@ -49,6 +60,16 @@ _LEAST_RANGE = 1e-3
 _RETURN = (3.0, 1.0)
 # Duration at the end in which levels are corrected, in natural periods.
 _ENDING = 0.6
+# Maximum number of corrections for secondary modes, and the decrease of the deviation below which
+# there is no further one: they converge up to about the first natural frequency.
+_CORRECTED, _DECREASE = 10, 0.85
+# Weight of the vibration after the end beside the deviation from the path.
+_AFTER = 4.0
+# Samples per period of the fastest mode; standard deviation of the filter of corrections, over the
+# first angular frequency; durations of their onset, in natural periods and as a fraction of the
+# path at most. Faster changes of the path of the first mode excite the others, also after the end
+# (test_a_wave_of_a_continuum_is_that_of_all_its_modes).
+_SEEN, _FILTER, _ONSET, _PART = 16, 1.2, 2.0, 0.25
 
 # Gauss points of an interval of unit length, and matrices that integrate polynomials through them
 # once and twice, up to each point and to the end, or evaluate them at the end.
@@ -117,6 +138,18 @@ class Path:
 
         return Path(self.breaks / unit, course)
 
+    def corrected(self, times: Array, by: Array) -> 'Path':
+        """Return the path with a spline through corrections added, shape (n,) each."""
+        from scipy.interpolate import make_interp_spline  # slow to import
+
+        more = Path._of(make_interp_spline(times, by, 5), times)
+
+        def course(t: Array) -> tuple[Array, Array, Array]:
+            own, other = self.course(t), more.course(t)
+            return own[0] + other[0], own[1] + other[1], own[2] + other[2]
+
+        return Path(self.breaks, course)
+
     def joined(self, stretch: float, rate: float, span: float) -> 'Path':
         """Return the path with a start at another state, from which it returns in a given time."""
         here = self.course(np.zeros(1))
@@ -162,11 +195,67 @@ def along(
     leaves the range of the model, or has no rest at its end.
     """
     request.holding_load()
-    follower = _PathFit(request, path, tolerance)
-    while follower.done < len(follower.edges) - 1:
-        follower.advance()
+    fit = _fitted(request, path, tolerance, check)
+    move = fit.move()
+    if not request.material.modes.ratios:
+        return move
+    return _with_modes(request, path, tolerance, fit, move, check)
+
+
+def _with_modes(
+        request: MoveRequest, path: Path, tolerance: float, fit: '_PathFit', move: Move,
+        check: Callable[[], None]) -> Move:
+    """Return the move whose secondary modes leave least to a path; another one fits the first."""
+    from scipy.ndimage import gaussian_filter1d  # slow to import
+
+    material, end = request.material, float(path.breaks[-1])
+    period = 2.0 * math.pi / request.frequency
+    fastest = max((material.modes.ratios[i] for i in material.modes.ringing), default=1.0)
+    count = max(len(fit.edges), math.ceil(_SEEN * end * fastest / period))
+    # The last period is after the end.
+    times = end / count * np.arange(count + math.ceil(count * period / end), dtype=float)
+
+    def left(move: Move) -> Array:
+        seen, _ = observed(sampled(
+            move.levels, request.start, times, material, request.delivery), material)
+        off: Array = path.course(np.minimum(times, end))[0] - seen
+        return off
+
+    off = left(move)
+    onset = min(_ONSET * period, _PART * end)
+    share = np.clip(np.minimum(times, end - times) / onset, 0.0, 1.0)
+    window = share ** 3 * (10.0 + share * (6.0 * share - 15.0))
+    weights, by = np.where(times > end, _AFTER, 1.0), np.zeros(len(times))
+    for _ in range(_CORRECTED):
+        least = np.max(weights * np.abs(off))
+        if least <= fit.allowed:
+            break
+        by += window * gaussian_filter1d(
+            off, _FILTER / (request.frequency * times[1]), mode='constant')
+        try:
+            after = _fitted(request, path.corrected(times, by), tolerance, check)
+            tried = after.move()
+        except RefusedError:
+            break  # the first mode would leave the range of the model
+        remaining = left(tried)
+        largest = np.max(weights * np.abs(remaining))
+        if largest < least:
+            fit, move, off = after, tried, remaining
+        if not largest <= _DECREASE * least:
+            break
+    most = int(np.argmax(np.abs(off)))
+    return move._replace(reason='' if abs(off[most]) <= TOLD * fit.range else fit.words(
+        float(abs(off[most])), float(times[most]), 'its secondary modes'))
+
+
+def _fitted(
+        request: MoveRequest, path: Path, tolerance: float, check: Callable[[], None]
+) -> '_PathFit':
+    fit = _PathFit(request, path, tolerance)
+    while fit.done < len(fit.edges) - 1:
+        fit.advance()
         check()
-    return follower.move()
+    return fit
 
 
 class _PathFit:
@@ -175,7 +264,7 @@ class _PathFit:
     def __init__(self, request: MoveRequest, path: Path, tolerance: float) -> None:
         self._request, self._path = request, path
         self.range, self.edges = _edges(request, path, tolerance)
-        self._allowed = tolerance * self.range
+        self.allowed = tolerance * self.range
         self.done = 0  # intervals with known levels
         self._levels: list[Level] = []
         self._states = [request.start]
@@ -212,7 +301,7 @@ class _PathFit:
             self._limited.add(Code.FLUX_LIMIT)
             self._lack = np.zeros(2)
         ways = [clipped]
-        if np.any(clipped != levels) or away > 10.0 * self._allowed:
+        if np.any(clipped != levels) or away > 10.0 * self.allowed:
             ways += [self._returning(edges[:keep + 1], clipped, x) for x in _RETURN]
         self._take(edges[:keep + 1], ways, stretch[:keep])
         self.done = last
@@ -356,7 +445,7 @@ class _PathFit:
             request.delivery)[motion.STRETCH]
         times = np.append(np.concatenate(self._times)[:begin], times)
         away = np.append(np.concatenate(self._away)[:begin], np.abs(stretch - wanted))
-        return Move(Code.PATH, levels, since + found[1], self._words(
+        return Move(Code.PATH, levels, since + found[1], self.words(
             float(np.max(away)), float(times[np.argmax(away)])))
 
     def _ended(self, request: MoveRequest, begin: int) -> Attempt:
@@ -376,9 +465,13 @@ class _PathFit:
         levels = np.append(levels, self._request.balance(self._followed))
         return solve(Template(rounded, levels, np.zeros_like(d_loads), d_loads), request)
 
-    def _words(self, largest: float, when: float) -> str:
-        """Return the largest deviation as text if it exceeds the tolerance, else an empty text."""
-        if largest <= self._allowed:
+    def words(self, largest: float, when: float, other: str = '') -> str:
+        """
+        Return the largest deviation as text if it exceeds the tolerance, else an empty text.
+
+        Another cause is named if the limits have no part in it.
+        """
+        if largest <= self.allowed:
             return ''
         request = self._request
         units, limits = request.units, request.limits
@@ -386,6 +479,7 @@ class _PathFit:
                f'{units.load_text(limits.maximum)}'] * (Code.FLUX_LIMIT in self._limited)
         why += [f'ramps of {units.slew_text(request.delivery.slew)}'] * (
             Code.SLEW_LIMIT in self._limited)
+        why += [other] * bool(not why and other)
         why += [f'a command period of {units.time_text(request.delivery.period)}'] * (
             not why and request.delivery.period > 0.0)
         return (

@@ -30,9 +30,11 @@ from hmsa.planning.shapers.request import MoveRequest, Shaper, StepBudget
 # Samples of the first period after a move, and their tolerance; that of a state that fades.
 _SAMPLED, _RTOL, _FADING_RTOL = 100, 1e-7, 1e-5
 _TIMES: Array = np.linspace(0.0, 1.0, _SAMPLED, dtype=np.float64)
-# Vibration in fractions of the move below which nothing is told, and from which another shaper is
-# advised; and that which an unshaped step leaves at least, so that only then it is computed.
-_TOLD, _MUCH, _LIKE_A_STEP = 5e-4, 1e-2, 0.4
+#: Vibration in fractions of the move below which nothing is told.
+TOLD = 5e-4
+# The same from which another shaper is advised, and from which that of an unshaped step is
+# computed, which may be less.
+_MUCH, _LIKE_A_STEP = 1e-2, 0.4
 # Smaller moves have no meaningful fractions.
 _LEAST_MOVE = 1e-6
 #: Options for a setpoint that ends before the move to it.
@@ -97,7 +99,7 @@ def remaining(request: MoveRequest, move: Move) -> Remaining | None:
     rows, whole = seen
     parts = np.abs(modes.at(request.target)) * np.ptp(rows, axis=1)
     most, vibration = int(np.argmax(parts)), float(np.ptp(whole)) / size
-    if vibration < _TOLD:
+    if vibration < TOLD:
         return None
     step = math.nan
     if vibration > _LIKE_A_STEP and move.code is not Code.STEP:
