@@ -19,8 +19,8 @@ of an hour; line makes cables, boards, amplifiers and sensors fail there, for tw
 kills the workers of a study. rates measures how many plans per second studies compute, for about
 seven minutes. lockstep compares the kernel of batches with C. continuum plays commands on finite
 elements, for eight minutes; compressible compares a compressible block with them, for three;
-predictions compares what plans predict there, for two; beam plays
-them on an exact rod, for three; beam-identification identifies
+predictions compares what plans predict there, for two; waves measures the amplitude of waves
+there, for five; beam plays commands on an exact rod, for three; beam-identification identifies
 recordings of this rod, for five.
 repeats plays what `hmsa learn` makes of repeats on finite elements and an exact rod, for half an
 hour.
@@ -66,6 +66,7 @@ TABLES |= {
     'lockstep': ('studies.lockstep',),
     'continuum': ('continuum.compare', 'continuum.little_damped'),
     'compressible': ('compressible.compare',), 'predictions': ('continuum.predicted',),
+    'waves': ('continuum.waves',),
     'repeats': ('repeats.compare',), 'beam': ('beam.compare', 'beam.sequences'),
     'beam-identification': ('beam.identified',),
     'modes': ('continuum.covered', 'continuum.identified')}

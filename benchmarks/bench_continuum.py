@@ -189,6 +189,46 @@ def predicted(*, quick: bool) -> Sheet:
         {'rows': figures}, worst <= _FACTOR)
 
 
+# Frequencies of waves in units of the first one, their amplitude, their cycles at that size, and
+# the largest relative error of the amplitude that a plan with modes may leave.
+_SHARES, _AMPLITUDE, _CYCLES, _WAVE_ERROR = (0.25, 0.5, 0.75), 0.05, 6.0, 0.02
+
+
+def waves(*, quick: bool) -> Sheet:
+    """Return the amplitudes of sine waves on finite elements, planned with several models."""
+    rows, figures, worst = [], [], 0.0
+    for shape in (1.0,) if quick else (0.3, 0.5, 1.0, 2.0):
+        paper, block = blocks(shape)
+        first = Actuator.from_parameters({
+            x: y for x, y in block.parameters.items() if not x.startswith('modes.')})
+        for share in _SHARES[1:2] if quick else _SHARES:
+            found = [_amplitude(shape, paper, x, share * block.scales.frequency) / _AMPLITUDE
+                     for x in (paper, first, block)]
+            figures.append({'shape': shape, 'frequency': share, 'amplitudes': found})
+            worst = max(worst, abs(found[-1] - 1.0))
+            rows.append([f'{shape:g}, {share:g} f₁', *(f'{x:.3f}' for x in found)])
+    return Sheet(
+        'continuum_waves',
+        f'Amplitude of sine waves of {_AMPLITUDE:g} on finite elements, over the requested one',
+        ('H/L, frequency', "paper's model", 'first mode alone', 'with its modes'), rows,
+        {'rows': figures}, worst <= _WAVE_ERROR)
+
+
+def _amplitude(shape: float, paper: Actuator, actuator: Actuator, frequency: float) -> float:
+    """Return the amplitude of the mean stretch in the middle of a wave that an actuator plans."""
+    plan = actuator.wave('sine', frequency, _AMPLITUDE, cycles=_CYCLES)
+    material, unit = paper.model.material, paper.block.time_unit
+    elements = Block(shape, J_LIM, material.zeta * material.c1 / 6.0, _MORE_SHAPES[shape])
+    loads = paper.model.units.of_level(plan.flux_densities[:-1])
+    times, stretch = elements.follow([*zip(
+        (np.diff(plan.times) / unit).tolist(), loads.tolist(), strict=True)])
+    middle = np.abs(times / times[-1] - 0.5) < 0.15
+    angle = 2.0 * math.pi * frequency * unit * times[middle]
+    found, *_ = np.linalg.lstsq(np.column_stack([
+        np.ones(len(angle)), np.sin(angle), np.cos(angle)]), stretch[middle])
+    return float(np.hypot(*found[1:]))
+
+
 # Recordings for identification: targets of unshaped steps, periods on each, duration in s, rate in
 # Hz, noise of the stretch, seeds of it, and targets of the plans.
 _STEPS, _DWELL, _DURATION = (1.1, 1.0, 1.2, 1.1, 0.9, 1.0, 1.15, 1.0), 8.0, 2.0
