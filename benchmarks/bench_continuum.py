@@ -191,7 +191,7 @@ def predicted(*, quick: bool) -> Sheet:
 
 # Frequencies of waves in units of the first one, their amplitude, their cycles at that size, and
 # the largest relative error of the amplitude that a plan with modes may leave.
-_SHARES, _AMPLITUDE, _CYCLES, _WAVE_ERROR = (0.25, 0.5, 0.75), 0.05, 6.0, 0.02
+_SHARES, _AMPLITUDE, _CYCLES, _WAVE_ERROR = (0.25, 0.5, 0.75), 0.05, 6.0, 0.04
 
 
 def waves(*, quick: bool) -> Sheet:
