@@ -24,8 +24,6 @@ from typing import Any, ClassVar
 from extras import has, needs
 from forks import Forked, ForkServer
 from hypothesis import HealthCheck, Phase, settings
-from hypothesis.internal.conjecture import providers
-from hypothesis.internal.constants_ast import Constants
 import pytest
 
 from hmsa.cli import terminal
@@ -98,8 +96,21 @@ def pytest_configure(config: pytest.Config) -> None:
     profile = config.getoption('--hypothesis-profile') or 'gate'
     settings.load_profile(profile)
     if profile == 'gate':
-        # Nor do its examples depend on constants in the modules that a worker happens to have
-        # imported, which each of them would parse.
+        leave_out_constants()
+
+
+def leave_out_constants() -> None:
+    """
+    Keep constants in the modules that a worker happens to have imported out of its examples.
+
+    Each worker would parse all of them: 2.4 s of processor time.
+    """
+    try:  # no setting does it; with a version that has neither of them, it takes that time
+        from hypothesis.internal.conjecture import providers
+        from hypothesis.internal.constants_ast import Constants
+    except ImportError:
+        return
+    if hasattr(providers, '_get_local_constants'):
         providers._get_local_constants = Constants
 
 
