@@ -1,5 +1,6 @@
 """The client of a planner: whom it waits for, verdicts of its own, the stop."""
 
+import math
 import re
 import signal
 import subprocess
@@ -63,6 +64,17 @@ def test_a_command_without_a_planner_says_again_and_again_what_it_waits_for(
     assert re.search('planner|samples', told[0])
     assert len(told) > 1
     assert all(x.startswith(f'{told[0][:-4]}, ') for x in told[1:])
+
+
+@pytest.mark.ros
+def test_a_wait_without_a_limit_names_none(ros, ros_env, capfd, monkeypatch):
+    monkeypatch.setattr(terminal, 'PATIENCE', 0.02)
+    said = []
+    with Link() as link:
+        link.spin_until(
+            lambda: said.append(capfd.readouterr().err) or 'rest' in said[-1], '',
+            timeout=math.inf, awaited='rest')
+    assert said[-1].startswith('waiting for rest ...')
 
 
 @pytest.mark.ros

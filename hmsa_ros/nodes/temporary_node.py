@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import nullcontext
 import json
+import math
 import os
 import re
 from time import monotonic
@@ -230,7 +231,8 @@ class TemporaryNode:
         """
         timeout = self.timeout if timeout is None else timeout
         deadline = time() + timeout
-        with under_way(f'waiting up to {timeout:g} s for {awaited}') if awaited else nullcontext():
+        longest = f' up to {timeout:g} s' if timeout < math.inf else ''
+        with under_way(f'waiting{longest} for {awaited}') if awaited else nullcontext():
             while not condition():
                 if time() > deadline:
                     raise HmsaError(f'waited {timeout:g} s: {failure}')
