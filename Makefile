@@ -52,7 +52,7 @@ full: tools ## run the slow tests too, and random examples, as before a release
 
 .PHONY: actions
 actions: $(VENV)/.control_msgs tools ## build control_msgs, and test the action that needs it
-	. $(CURDIR)/$(VENV)/control_msgs/setup.sh && $(PYTEST) test/test_follow.py
+	. $(CURDIR)/$(VENV)/control_msgs/setup.sh && $(PYTEST) test/test_follow.py $(ARGS)
 
 .PHONY: check
 check: tools ## run the tests that need no nodes
