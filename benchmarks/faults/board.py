@@ -9,6 +9,8 @@ from time import monotonic
 import tty
 
 _POLL = 0.005
+# From this time in s on, between two looks at the line, the host halted the board.
+_HALT = 0.05
 
 
 class Board:
@@ -47,6 +49,7 @@ class Board:
         self._fds: tuple[int, int] | None = None
         self._turn = threading.RLock()
         self._ended = False
+        self._halts: list[tuple[float, float]] = []
         self.plug()
         threading.Thread(target=self._work, daemon=True).start()
 
@@ -65,6 +68,10 @@ class Board:
     def largest_since(self, time: float) -> float:
         """Return the largest level set after a time."""
         return max((abs(level) for x, level in self.record if x > time), default=0.0)
+
+    def halted_since(self, time: float) -> float:
+        """Return for how long in s the host halted the board after a time."""
+        return sum(length for x, length in self._halts if x > time)
 
     def plug(self) -> None:
         """Plug the cable in: a new line at the same path."""
@@ -101,7 +108,12 @@ class Board:
 
     def _work(self) -> None:
         waiting = b''
+        looked = monotonic()
         while not self._ended:
+            now = monotonic()
+            if now - looked > _HALT:
+                self._halts.append((now, now - looked))
+            looked = now
             with self._turn:
                 fds = self._fds
                 if fds is None:

@@ -315,8 +315,7 @@ def _stalled(rig: Rig, who: str, latest: float) -> Seen:
             'lead_time': PATIENT_LEAD})}
         bench.ready()
         rig.ready('planner')
-        rig.sequence([(x, 0.3) for x in (1.1, 1.2, 1.3) * 4])
-        rig.spin_until(lambda: bench.board.level, 'a level')
+        _switch_on(bench, lambda: rig.sequence([(x, 0.3) for x in (1.1, 1.2, 1.3) * 4]))
         rig.spin(0.5)
         begin = monotonic()
         processes[who].send(signal.SIGSTOP)
@@ -325,21 +324,25 @@ def _stalled(rig: Rig, who: str, latest: float) -> Seen:
         rig.spin_until(lambda: any(x['code'] == CUT_OFF for x in rig.verdicts), 'the status')
         # The board reads the level after the driver has written it.
         rig.spin_until(lambda: bench.board.off_since(begin) < math.inf, 'the coil to be off')
-        off = bench.board.off_since(begin)
+        off, halted = bench.board.off_since(begin), bench.board.halted_since(begin)
         rig.spin(1.0)
         again = bench.board.largest_since(begin + off)
-        rig.setpoint(1.1)
-
-        def on() -> bool:
-            # A busy host may stop one of them for as long: then it takes another request.
-            if rig.verdicts[-1]['code'] == CUT_OFF:
-                rig.setpoint(1.1)
-            return bool(bench.board.level)
-
-        rig.spin_until(on, 'the level of a request')
+        _switch_on(bench, lambda: rig.setpoint(1.1))
         return Seen(
             f'{again:g} T before the next request', f'off after {off:.2f} s',
-            not again and off < latest)
+            not again and off < latest + halted)
+
+
+def _switch_on(bench: _Bench, request: Callable[[], object]) -> None:
+    """Request motion until the coil is on: a busy host may stop a process for as long."""
+    request()
+
+    def on() -> bool:
+        if bench.rig.verdicts[-1]['code'] == CUT_OFF:
+            request()
+        return bool(bench.board.level)
+
+    bench.rig.spin_until(on, 'a level')
 
 
 for _key, _who, _off, _latest in (
