@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 from benchmarks.block_elements import Block
 from hmsa.cli import main
@@ -23,6 +24,7 @@ from hmsa.identification.quantities import (
     values_of,
 )
 from hmsa.identification.response import respond
+from hmsa.model import law
 from hmsa.model.equations import elastic_force
 from hmsa.model.modes import Modes
 from hmsa.model.parameters import paper_actuator
@@ -55,7 +57,8 @@ def recorded(actuator=TRUE, *, noise=1e-3, extras=None, seed=0, count=6) -> Meas
 
 
 @pytest.mark.parametrize(('slew', 'extras'), [
-    (np.inf, {}), (20.0, {'coil_time_constant': 5e-4, 'viscoelastic_ratio': 0.1})])
+    (np.inf, {}), (20.0, {'coil_time_constant': 5e-4, 'viscoelastic_ratio': 0.1}),
+    (np.inf, {'damping_exponent': -1.5})])
 def test_derivatives_with_modes_are_those_of_finite_differences(slew, extras):
     times = np.sort(np.random.default_rng(0).uniform(0.0, 0.25, 200))
     recording = Measurement(
@@ -90,6 +93,26 @@ def test_response_with_modes_is_the_motion_of_the_simulation(exponents):
         simulation.advance(round(1e9 * time))
         stretch.append(simulation.stretch)
     assert recording.stretch == pytest.approx(stretch, abs=1e-6)
+
+
+def test_damping_changes_with_a_power_of_the_stretch():
+    recording, exponent = recorded(BLOCK, noise=0.0, count=1), -2.0
+    group, unit = BLOCK.nondimensional, BLOCK.time_unit
+    load = recording.levels[1] / BLOCK.flux_density_unit
+
+    def change(_, state):
+        stretch, rate = state
+        damping = law.damping(stretch, group.packed) * stretch ** exponent
+        inertia = -0.25 * rate ** 2 / stretch ** 4
+        net = load - elastic_force(stretch, group) - damping * rate - inertia
+        return rate, net / law.mass(stretch, group.packed)
+
+    times = (recording.time - recording.level_times[1]) / unit
+    after = times > 0.0
+    expected = solve_ivp(
+        change, (0.0, times[-1]), (1.0, 0.0), t_eval=times[after], rtol=1e-9, atol=1e-11).y[0]
+    found = respond(recording, values_of(BLOCK, {'damping_exponent': exponent}), ())
+    assert found.stretch[after] == pytest.approx(expected, abs=1e-6)
 
 
 @pytest.fixture(scope='module')
@@ -236,6 +259,10 @@ def test_finite_elements_are_rejected_for_a_second_mode_and_identified_with_it()
     found = identify(recording, WITH_MODES, actuator=known)
     assert found.verdict == 'identified', found.reason
     assert found.residual_rms < 0.8 * plain.residual_rms
+    # The viscous stress of an elongated block acts on a smaller area, and its rate is smaller.
+    assert -3.5 < found.parameters['damping_exponent'].value < -1.0
+    assert found.parameters['damping_coefficient'].value == pytest.approx(
+        BLOCK.damping_coefficient, rel=0.1)
     assert found.parameters['remanence'].value == pytest.approx(BLOCK.remanence, rel=0.03)
     assert any('modes leave' in x for x in found.warnings)
 

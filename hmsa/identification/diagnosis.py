@@ -164,6 +164,8 @@ def allowed(fit: Fit) -> Array:
             values['damping_coefficient'], 0.05 * quantities.damping_unit(values)),
         'stretch_bias': 0.05, 'stretch_gain': 0.1, 'sensor_latency': 0.5 * unit,
         'coil_time_constant': max(_RELATIVE * values['coil_time_constant'], 0.1 * unit),
+        # Between stretches of 0.9 and 1.1 it changes the damping by a fifth.
+        'damping_exponent': 1.0,
         'constant_force': 0.1 * load, 'initial_stretch': 0.05, 'initial_rate': 0.5 / unit,
         # The share of a mode shows more of it than its damping does.
         **{x[2]: 0.5 for x in quantities.SECONDARY},

@@ -49,8 +49,10 @@ _MOST_SAMPLES = 2000
 # Frequency ratios from which each mode is sought, besides those of the lines in the residuals.
 _STARTS = (1.2, 1.4, 1.7, 2.1, 2.7, 3.4, 4.5, 6.0)
 _SHARE, _LEAST_DAMPING, _MOST_DAMPING = 0.1, 0.03, 0.3
-# Transverse factor and maximum J_lim at which to begin.
-_TRANSVERSE, _LOOSE = 1.5, 1e6
+# What a block has besides, with the values of one that deforms uniformly, and at which to begin;
+# maximum J_lim there.
+_BESIDES = {'transverse_mass_factor': (1.0, 1.5), 'damping_exponent': (0.0, 0.0)}
+_LOOSE = 1e6
 # Simulations from each start, and for the best; for the first mode with its factor.
 _FEW, _FULL, _FIRST = 8, 30, 8
 # Maximum sum of the sizes of all shares.
@@ -349,7 +351,7 @@ def with_modes(
     Returns
     -------
     Fit
-        For a block, it may also free how the frequency changes with the stretch.
+        For a block, it may also free how frequency and damping change with the stretch.
 
     """
     recording = one.recording
@@ -358,9 +360,8 @@ def with_modes(
     highest, lowest = highest_ratio(recording, own), _lowest(best.values)
     wide, values = tuple(free), dict(best.values)
     if values['law'] is None or not values['law'].section:
-        wide = (*(x for x in free if x != 'chain_limit'), 'transverse_mass_factor')
-        if values['transverse_mass_factor'] == 1.0:
-            values['transverse_mass_factor'] = _TRANSVERSE
+        wide = tuple(dict.fromkeys((*(x for x in free if x != 'chain_limit'), *_BESIDES)))
+        values |= {x: begin for x, (usual, begin) in _BESIDES.items() if values[x] == usual}
         if 'chain_limit' in free:
             values['chain_limit'] = min(limit, _LOOSE)
     damping = _damping_ratio(values)
@@ -384,16 +385,15 @@ def with_modes(
 
 
 def _completed(best: Fit, free: Sequence[str]) -> Fit:
-    """Return a fit in which J_lim is free, too, and the transverse factor if it matters."""
+    """Return a fit in which J_lim is free, too, and of `_BESIDES` what matters."""
     recording = best.recording
     if 'chain_limit' in free and 'chain_limit' not in best.free:
         found = fit(recording, best.values, (*best.free, 'chain_limit'), most=_FULL)
         if found is not None and _possible(found):
             best = found
-    if 'transverse_mass_factor' in best.free:
-        values = {**best.values, 'transverse_mass_factor': 1.0}
-        less = fit(recording, values, tuple(
-            x for x in best.free if x != 'transverse_mass_factor'), most=_FULL)
+    for name in [x for x in _BESIDES if x in best.free and x not in free]:
+        values = {**best.values, name: _BESIDES[name][0]}
+        less = fit(recording, values, tuple(x for x in best.free if x != name), most=_FULL)
         if less is not None and _possible(less) and _gain(less, best)[0] < _CHI_SQUARED:
             best = less
     return best if best.converged else fit(recording, best.values, best.free) or best

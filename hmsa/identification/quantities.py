@@ -58,6 +58,9 @@ QUANTITIES: dict[str, Quantity] = {
     'chain_limit': Quantity(
         '', scale='inverse', advice='record larger stretches, and rest at three or more levels'),
     'damping_coefficient': Quantity('N s/m', scale='linear', advice=_STEP),
+    'damping_exponent': Quantity(
+        '', 0.0, 'linear', -6.0, 6.0,
+        advice='record unshaped steps about stretches that differ widely, below and above 1'),
     'time_unit': Quantity('s', advice=_STEP),
     'stretch_bias': Quantity(
         '', 0.0, 'linear', -math.inf, advice='record rest without field, or calibrate the '
@@ -433,7 +436,8 @@ class Known:
         # Constants of a model, modes, compressibility and factors of the mass are not estimated
         # further: keep only the other parameters.
         kept = [i for i, x in enumerate(names)
-                if not x.startswith(('law.', 'modes.')) and x not in (*FACTORS, 'bulk_ratio')]
+                if not x.startswith(('law.', 'modes.')) and x not in (
+                    *FACTORS, 'damping_exponent', 'bulk_ratio')]
         if not kept:
             return cls()
         free = check_free(names[i] for i in kept)

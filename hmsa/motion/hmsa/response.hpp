@@ -1,8 +1,9 @@
 // The response to recorded levels with its derivatives by the parameters, in seconds:
 //     m(l) l'' + m'(l) l'^2/2 + d l' + a psi'(l) + sum_i gamma_i a (psi'(l) - w_i) = k B + f
 //     tau_i w_i' = psi'(l) - w_i        tau_c B' = u - B
-// divided by the density and L^2; u is the piecewise linear level of the amplifier. Secondary modes
-// follow the same load, and the sensor sees the sum of all modes.
+// divided by the density and L^2; u is the piecewise linear level of the amplifier. The damping d of
+// a block may grow with a power of its stretch. Secondary modes follow the same load, and the sensor
+// sees the sum of all modes.
 #pragma once
 #include "motion.hpp"
 
@@ -12,7 +13,7 @@ namespace hmsa {
 // Beyond all indices, constant i of the hyperelastic model is the first plus i, and the start time
 // of piece m the second plus m. Two forces that are zero in every motion only serve
 // differentiation: one against the motion at any rate, and one with the square of the rate.
-enum Theta { stiffness_of, damping_of, drive_of, force_of, lag_of, stretch_of, rate_of, first_branch };
+enum Theta { stiffness_of, damping_of, drive_of, force_of, lag_of, stretch_of, rate_of, grade_of, first_branch };
 constexpr int branch_places = 3 + flow_constants, mode_places = 5;
 constexpr int friction_of = 400, square_of = 401, constant_of = 500, switch_of = 1000;
 // Rate, relative to the fastest frequency, over which the friction changes sign.
@@ -43,6 +44,13 @@ struct Recorded {
     // null for zero, and if not needed.
     const double *behind;
     double *behind_last;
+    bool graded() const  // whether the damping changes with the stretch
+    {
+        for (int j = 0; j < wanted_count; j++)
+            if (wanted[j] == grade_of)
+                return true;
+        return theta[grade_of] != 0;
+    }
     bool by_constants() const
     {
         for (int j = 0; j < wanted_count; j++)
@@ -124,7 +132,8 @@ template <class C, class System, int NB = most_branches> struct Response {
     Response(const Recorded &recorded, int first) : of(recorded), from(first) { step.use(width); }
     System system;
     typename System::Bare bare;  // the system without derivatives
-    S a, damping, drive, force, lag;
+    S a, damping, drive, force, lag, grade;
+    bool graded;  // whether the damping changes with the stretch
     Branches<NB, S> branches;
     Branches<NB> bare_branches;
     std::conditional_t<modal, Modal<S>, char> modes{};
@@ -159,7 +168,8 @@ template <class C, class System, int NB = most_branches> struct Response {
                     system.seed(wanted - constant_of, j);
             });
         a = seeded_at(stiffness_of), damping = seeded_at(damping_of), drive = seeded_at(drive_of);
-        force = seeded_at(force_of), lag = seeded_at(lag_of);
+        force = seeded_at(force_of), lag = seeded_at(lag_of), grade = seeded_at(grade_of);
+        graded = modal && bare.rest > 0 && of.graded();
         rubs = squares = -1;
         each([&](int j, int wanted) {
             rubs = wanted == friction_of ? j : rubs;
@@ -213,7 +223,10 @@ template <class C, class System, int NB = most_branches> struct Response {
                 incline(pull, squares, slope(pull, squares) - abs(v) * v);
         }
         by[0] = x[1];
-        [[maybe_unused]] S net{};
+        [[maybe_unused]] S net{}, less{};  // less: by which the damping is below that at rest
+        if constexpr (modal)
+            if (graded && first(x[0]) > 0)
+                pull = pull + (less = damping * (S{} + 1.0 - power(x[0], grade)) * x[1]);
         by[1] = system.acceleration(x[0], x[1], damping, [&](const S &elastic)
             __attribute__((always_inline)) {
                 S held = elastic;
@@ -221,7 +234,7 @@ template <class C, class System, int NB = most_branches> struct Response {
                     __attribute__((always_inline)) { held = held + more; });
                 const S beyond = pull - a * held;
                 if constexpr (modal)
-                    net = beyond;
+                    net = beyond - less;
                 return beyond;
             });
         if constexpr (modal)
