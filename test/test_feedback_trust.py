@@ -269,6 +269,17 @@ def test_a_sensor_that_changes_is_named_costs_nothing_and_is_forgotten(change, m
     assert 'sensor has changed' not in it.message
 
 
+def test_a_damping_that_jumps_is_learnt_and_does_not_end_feedback():
+    it = bench(False, noise=3e-4, factors={'shear_modulus': 1.1})
+    moves(it, (1.3, 1.15))
+    it.plant.block = replace(
+        it.plant.block, damping_coefficient=2.0 * it.plant.block.damping_coefficient)
+    it.plant.solution = None
+    # With the damping confirmed before, each of them would vibrate by 17 %.
+    assert np.max(np.abs(moves(it, (1.35, 1.05, 1.35, 1.1)))[2:]) < 0.5
+    assert 'feedback_ended' not in it.codes()
+
+
 def test_a_modulus_that_jumps_is_told_from_a_sensor_in_the_next_move():
     it = bench(False, noise=3e-3, factors={'shear_modulus': 1.1})
     moves(it, (1.3, 1.15, 1.4))

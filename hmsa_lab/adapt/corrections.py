@@ -90,7 +90,7 @@ class Corrections:
         segment, *rest = draft.segments
         estimate = joint.foreseen(draft.begin)
         joint.moves = Moves(not same_parameters(
-            joint.based(draft.levels[-1].model), joint.given))
+            joint.based(draft.levels[-1].model), joint.given), joint.doubted)
         joint.next_update = joint.next_sample = joint.waits = 0
         # An amplifier that saturated may not do so any more.
         joint.largest = math.inf

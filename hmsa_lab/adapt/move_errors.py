@@ -24,6 +24,7 @@ class Moves:
     """How the moves of a request were planned; times are timestamps in ns."""
 
     learnt: bool = False  # planned with learnt parameters
+    doubted: bool = False  # planned while samples did not fit
     expected: float = 0.0  # predicted amplitude of the newest move
     corrected: list[int] = field(default_factory=list)  # times from which plans were corrected
     planned_anew: float = math.inf  # time from which they are planned with learnt parameters
@@ -75,7 +76,8 @@ class MoveErrors:
         level = plan.level(arrival)
         if not (learnt or later) or given.material.creep or plan.levels[-1] is not level:
             return ''
-        if not learnt:
+        if not learnt or moves.doubted:
+            # Open loop would vibrate, too, if the actuator has changed.
             found = replace(found, vibration=math.nan)
         elif _or(early.vibration, 0.0) > _or(found.vibration, 0.0):
             found = replace(
