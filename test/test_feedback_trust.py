@@ -316,6 +316,14 @@ def test_what_a_sensor_showed_that_failed_in_the_first_move_ends_with_it(change,
         it.runtime.follower.joints['a'].given.actuator.remanence, rel=1e-3)
 
 
+def test_a_saturated_amplifier_does_not_end_feedback():
+    it = bench(False, noise=3e-4, factors={'shear_modulus': 1.1})
+    moves(it, (1.37, 1.11))
+    it.plant.limit = 0.07
+    moves(it, (1.24,))
+    assert 'feedback_ended' not in it.codes()
+
+
 def test_a_request_tries_again_what_saturated_an_amplifier():
     it = bench(False, plant={'limit': 0.06})
     it.move(1.4, 400 * MS)

@@ -244,10 +244,13 @@ class AdaptiveJoint:
 
     def applied(self, stamp: int, flux_density: float) -> None:
         """Record that a level in T has taken effect, before the plan does."""
-        wanted = self.planner.plan.level(stamp).flux_density
+        plan = self.planner.plan
+        place = plan.place(stamp)
+        wanted, *early = (x.flux_density for x in plan.levels[place:place + 2])
         if abs(flux_density) > self.largest:
             self.largest = math.inf
-        if wanted and 0.0 < flux_density / wanted < 1.0 - _ROUNDED:
+        if wanted and 0.0 < flux_density / wanted < 1.0 - _ROUNDED and not any(
+                math.isclose(flux_density, x, rel_tol=_ROUNDED) for x in early):
             self.largest = abs(flux_density)
 
     def _off(self, stamp: int, field: float) -> str:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
+import math
 from typing import Any
 
 from hmsa.judge.records import SensorModel
@@ -258,8 +259,8 @@ class Feedback(Follower):
     def _audit(self, joint: AdaptiveJoint, hold: SetpointSamples) -> Awaited[None]:
         """Decide by the samples of a setpoint whether feedback ends."""
         if joint.lost or joint.trust.ended or joint.trust.why or (
-                joint.estimator.screening.trouble):
-            # With a failing sensor, nothing can be concluded about the move.
+                joint.estimator.screening.trouble or math.isfinite(joint.largest)):
+            # With a failing sensor or another field, nothing can be concluded about the move.
             return
         plan = joint.planner.plan
         why = yield from joint.ledger.take(
