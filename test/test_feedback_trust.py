@@ -41,7 +41,8 @@ def bench(slow=True, noise=1e-4, plant=None, factors=None, **more):
     """Return a bench; a slow block has a time scale of 44 ms, the other one of 4.4 ms."""
     nominal, true = paper(slow, **(factors or {}))
     found = Bench(
-        Plant(true, **(plant or {})), nominal, noise, lead=(2 if slow else 50) * MS, **more)
+        Plant(true, **(plant or {})), nominal, noise,
+        **{'lead': (2 if slow else 50) * MS, **more})
     found.pass_time(100 * MS)
     return found
 
@@ -322,6 +323,21 @@ def test_a_saturated_amplifier_does_not_end_feedback():
     it.plant.limit = 0.07
     moves(it, (1.24,))
     assert 'feedback_ended' not in it.codes()
+
+
+def commanded(it, change):
+    """Have a device apply what is made of each timestamp and level in T."""
+    command = it.plant.command
+    it.plant.command = lambda stamp, level: command(*change(stamp, level))
+
+
+def test_a_reversed_field_is_not_corrected_over_and_over():
+    it = bench(False, noise=1e-3, factors={'shear_modulus': 1.1}, lead=2 * MS)
+    moves(it, (1.22, 1.06))
+    corrected = it.codes().count('corrected')
+    commanded(it, lambda stamp, level: (stamp, -level))
+    moves(it, (1.2,))
+    assert it.codes().count('corrected') == corrected
 
 
 def test_a_request_tries_again_what_saturated_an_amplifier():

@@ -53,6 +53,8 @@ class RunningPlan:
         self.model = model
         #: Expected lateness, in ns, of all future levels.
         self.delay = 0
+        #: Whether the newest level that took effect was not commanded.
+        self.foreign = False
         self._strayed = 0.0
         self._initial = stretch
         self._history = History(Timeline(0, (), ()))
@@ -240,6 +242,7 @@ class RunningPlan:
         """Record a change of level as `History.with_news` does; None if it is already known."""
         self._history, deviation = self._history.with_news(stamp, flux_density, tolerance)
         if deviation is not None:
+            self.foreign = deviation.foreign
             deviation = replace(deviation, effect=self._effect(deviation, tolerance))
             self._strayed += deviation.effect
             if self._strayed > _LITTLE:
