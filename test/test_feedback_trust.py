@@ -340,6 +340,17 @@ def test_a_reversed_field_is_not_corrected_over_and_over():
     assert it.codes().count('corrected') == corrected
 
 
+def test_what_late_levels_leave_is_not_corrected_by_levels_as_late():
+    it = bench(False, noise=3e-4, factors={'shear_modulus': 1.1}, lead=2 * MS)
+    moves(it, (1.3, 1.15))
+    corrected = it.codes().count('corrected')
+    commanded(it, lambda stamp, level: (
+        stamp + int(np.random.default_rng((4, stamp)).uniform(1, 5) * MS), level))
+    moves(it, (1.35, 1.05, 1.35))
+    # Until the first levels were late, nobody knows.
+    assert it.codes().count('corrected') <= corrected + 3
+
+
 def test_a_request_tries_again_what_saturated_an_amplifier():
     it = bench(False, plant={'limit': 0.06})
     it.move(1.4, 400 * MS)

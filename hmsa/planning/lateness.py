@@ -156,6 +156,12 @@ class Lateness:
         """Expected lateness of the next commands in ns."""
         return median_low(self._likely()[0])
 
+    @property
+    def uneven(self) -> int:
+        """Usual spread of the lateness of the next commands in ns."""
+        usual = self._likely()[0]
+        return usual[-1] - usual[0]
+
     def scenarios(self, count: int, most: int) -> NDArray[np.int64]:
         """Return the possible lateness of commands in ns; shape (at most `most`, count)."""
         usual, exception = self._likely()

@@ -53,6 +53,8 @@ class RunningPlan:
         self.model = model
         #: Expected lateness, in ns, of all future levels.
         self.delay = 0
+        #: Spread of that, in ns.
+        self.uneven = 0
         #: Whether the newest level that took effect was not commanded.
         self.foreign = False
         self._strayed = 0.0

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+import itertools
 import math
 from typing import TYPE_CHECKING
 
@@ -296,11 +297,15 @@ def _gains(joint: AdaptiveJoint, arrival: int, draft: Draft | None) -> Draft | N
     hidden = MUCH * step if not arrival and abs(
         joint.start - planner.model.actuator.rest) < _FIRST and confounded(
             doubted, _HIDDEN * step) else 0.0
+    # So must levels that are late by chance, whose vibration may come on top.
+    levels = (planner.plan.level(draft.begin - 1), *draft.levels)
+    uneven = math.hypot(*(planner.vibration(planner.uneven, y.flux_density - x.flux_density)
+                          for x, y in itertools.pairwise(levels)))
     for each, least in ((doubted, hidden), (estimate, 0.0)):
         before = expect(each, course, slew, segment.arrival or 0)
         after = expect(each, _drafted(draft, planner.plan), slew)
         if not worthwhile(
-                before, after, max(gain, least, _NOISE * estimate.noise),
+                before, after, max(gain, least, uneven, _NOISE * estimate.noise),
                 little=LITTLE * step, share=SHARE if arrival else AT_REST):
             return None
     joint.after = after.size

@@ -155,9 +155,9 @@ class Deviations:
                 found.late, joint, due, tolerance,
                 2.0 * planner.vibration(1, found.change) / step, self._receipts.steady,
                 None if sent is None else due - sent)
-            expected = self.lateness.expected
+            expected, uneven = self.lateness.expected, self.lateness.uneven
             for other in self._group.planners.values():
-                other.delay = expected
+                other.delay, other.uneven = expected, uneven
         self._strayed[joint] = self._strayed.get(joint, 0.0) + cost
         if (settings.replan_late and self._strayed[joint] > SHARE
                 and not planner.as_sent(stamp - max(found.late, 0) - 1)
