@@ -204,6 +204,16 @@ def test_a_large_mode_that_changes_with_the_stretch_is_named_and_asks_for_smalle
     assert 'record steps half as large' in found.reason
 
 
+def test_close_modes_that_change_with_the_stretch_are_no_single_one_of_more_damping():
+    known = replace(BLOCK, damping_coefficient=0.25)
+    found = identify(recorded(replace(known, mass_factor=1.2, modes=Modes(
+        (1.7, 2.1), (0.12, 0.12), (0.05, 0.06), (0.4, 0.4), (-2.0, 1.5))), count=5),
+        WITH_MODES, actuator=known)
+    assert found.verdict == 'identified', found.reason
+    assert [x.ratio[0] for x in found.modes] == pytest.approx([1.7, 2.1], rel=0.05)
+    assert [x.share[0] for x in found.modes] == pytest.approx([0.12, 0.12], rel=0.15)
+
+
 def test_without_modes_none_is_found():
     found = identify(recorded(replace(BLOCK, mass_factor=1.3)), WITH_MODES, actuator=BLOCK)
     assert found.verdict == 'identified', found.reason

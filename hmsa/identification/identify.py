@@ -29,6 +29,7 @@ from hmsa.identification.modal import (
     explained,
     lines_of,
     modes_in,
+    narrower,
     rescaled,
     stiffens,
     with_modes,
@@ -184,8 +185,8 @@ def _with_modes(
     one, tried, agreed = search(recording, begin, first)
     start = one.values if 'shear_modulus' in together or together == first else rescaled(
         one.values, values['shear_modulus'], together)
-    best = with_modes(
-        one, start, together, actuator.chain_limit, actuator.modes.numbers)
+    setting = (one, start, together, actuator.chain_limit, actuator.modes.numbers)
+    best = narrower(with_modes(*setting), *setting)
     return _conclude(
         *_with_errors_of_stamps(best), [], tried, agreed, given, actuator.chain_limit, one)
 

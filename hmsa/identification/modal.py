@@ -19,7 +19,7 @@ import numpy as np
 
 from hmsa import motion
 from hmsa.identification import quantities
-from hmsa.identification.diagnosis import frequency_of
+from hmsa.identification.diagnosis import distant, frequency_of
 from hmsa.identification.fit import Fit, fit, HALF_95, loss, whiteness
 from hmsa.identification.measurement import Measurement, pieces
 from hmsa.identification.quantities import MODES, SECONDARY
@@ -55,18 +55,21 @@ _BESIDES = {'transverse_mass_factor': (1.0, 1.5), 'damping_exponent': (0.0, 0.0)
 _LOOSE = 1e6
 # Simulations from each start, and for the best; for the first mode with its factor.
 _FEW, _FULL, _FIRST = 8, 30, 8
+# Fits in which the damping ratios follow the frequencies.
+_REPEATS = 2
 # Maximum sum of the sizes of all shares.
 _WHOLE = 0.9
 # Minimum improvement of chi-squared by a mode; and of the loss, as a fraction, if it leaves more
-# than noise.
-_CHI_SQUARED, _PART = 30.0, 0.15
+# than noise: a mode of given damping stands for less else.
+_CHI_SQUARED, _PART, _PART_VISCOUS = 30.0, 0.15, 0.05
 # Ratio of two frequencies below which they are those of one mode that changes with the stretch.
 _NEAR = 1.02 * LEAST_RATIO
 # Lowest ratio of a mode of a beam: the second has 6.3 where straight, 3.6 where bent to 0.75.
 _OF_BEAMS = 2.5
 # Relative change of the force by J_lim that is noticeable.
 _STIFFENS = 0.04
-#: Fraction of the residuals' sum of squares that all modes together explain at least.
+#: Fraction of the residuals' sum of squares that all modes together explain at least, and their
+#: dampings beside those of a viscous material.
 ENOUGH = 0.25
 
 
@@ -327,7 +330,8 @@ def rescaled(
 
 def with_modes(
         one: Fit, start: Mapping[str, Any], free: Sequence[str], limit: float,
-        given: Sequence[Sequence[float]] = (), most: int = len(SECONDARY)) -> Fit:
+        given: Sequence[Sequence[float]] = (), most: int = len(SECONDARY), *,
+        viscous: bool = False) -> Fit:
     """
     Return the best fit with secondary modes, from one of the first mode alone.
 
@@ -347,6 +351,8 @@ def with_modes(
         Numbers of modes to try first, as `Modes.numbers`.
     most : int
         Maximum number of modes.
+    viscous : bool
+        Whether their damping ratios are those of a viscous material.
 
     Returns
     -------
@@ -370,7 +376,9 @@ def with_modes(
         begins += [(x, min(max(damping, _LEAST_DAMPING) * x, _MOST_DAMPING)) for x in _STARTS]
         rows = [
             *given[i:i + 1], *((x, _SHARE, y) for x, y in begins if lowest < x < highest)]
-        wanted = (*wide, *names[:3])
+        if viscous:
+            rows = [(*x[:2], max(damping, _DAMPED[0]) * x[0], *x[3:]) for x in rows]
+        wanted = (*wide, *names[:2 if viscous else 3])
         trials = [y for x in rows if (y := fit(
             recording, {**values, **dict(zip(names, x, strict=False))}, wanted,
             most=_FEW)) is not None and _possible(y)]
@@ -378,10 +386,40 @@ def with_modes(
             break
         found = min(trials, key=lambda x: loss(x.residual, best.scale))
         found = fit(recording, found.values, wanted, most=_FULL) or found
-        if not (_possible(found) and _better(best, found)):
+        found = _viscous(found) if viscous else found
+        if not (_possible(found) and _better(best, found, _PART_VISCOUS if viscous else _PART)):
             break
         best, wide, values = found, found.free, found.values
     return _completed(best, free) if quantities.modes_of(best.values) else best
+
+
+def narrower(
+        best: Fit, one: Fit, start: Mapping[str, Any], free: Sequence[str], limit: float,
+        given: Sequence[Sequence[float]]) -> Fit:
+    """
+    Return a fit with modes, in which none stands for several if the recording allows it.
+
+    Several modes of a continuum that lose step look like one of more damping, but keep their
+    vibration: plans that count on its decay leave several times as much (benchmarks continuum).
+    Where modes leave more than noise, those with the damping of a viscous material are better,
+    unless they leave clearly more. Arguments are those of `with_modes`, after its result.
+    """
+    found = whiteness(best.root * best.residual)
+    if not quantities.modes_of(best.values) or found.white or distant(best, found):
+        return best
+    other = with_modes(one, start, free, limit, given, viscous=True)
+    return other if quantities.modes_of(other.values) and _gain(other, best)[1] < ENOUGH else best
+
+
+def _viscous(found: Fit) -> Fit:
+    """Return a fit whose damping ratios grow with the frequency, as by a viscous stress."""
+    for _ in range(_REPEATS):
+        damping = max(_damping_ratio(found.values), _DAMPED[0])
+        values = {**found.values, **{
+            x[2]: min(damping * found.values[x[0]], _DAMPED[1])
+            for x in quantities.modes_of(found.values)}}
+        found = fit(found.recording, values, found.free, most=_FULL) or found
+    return found
 
 
 def _completed(best: Fit, free: Sequence[str]) -> Fit:
@@ -430,11 +468,11 @@ def _gain(before: Fit, after: Fit) -> tuple[float, float]:
     return 2.0 * (one - two), 1.0 - two / max(one, 1e-300)
 
 
-def _better(before: Fit, after: Fit) -> bool:
+def _better(before: Fit, after: Fit, least: float) -> bool:
     """Return whether a fit explains more than one with fewer parameters by chance does."""
     chi_squared, part = _gain(before, after)
     return chi_squared > _CHI_SQUARED and (
-        part > _PART or whiteness(after.root * after.residual).white)
+        part > least or whiteness(after.root * after.residual).white)
 
 
 def explained(one: Fit, found: Fit) -> float:
