@@ -421,10 +421,12 @@ def _warnings(
                 'mass_factor is free in place of shear_modulus, of which the motion shows only '
                 f'their ratio: it is for {best.values["shear_modulus"]:.6g} Pa')
         if not known.whiteness.white:
+            left = 100.0 * diagnosis.unexplained(best)
             found.append(
-                f'the modes leave {100.0 * diagnosis.unexplained(best):.2g} % of the motion, as '
-                'those of a continuum change with the stretch: intervals include it, and plans of '
-                f'modal leave up to {100.0 * diagnosis.cost(best, (), None):.2g} % of a step')
+                f'the modes leave {left:.2g} % of the motion, as those of a continuum change with '
+                'the stretch: intervals include it, and plans of modal leave up to '
+                f'{100.0 * diagnosis.cost(best, (), None):.2g} % of a step, and up to '
+                f'{left * diagnosis.LEFT_AT_3:.2g} % with robust_order 3')
     if outliers:
         found.append(
             f'{outliers} of {len(recording.time)} samples are more than six standard deviations '
