@@ -53,7 +53,7 @@ DISTANT = 0.1  # residual relative to the motion above which nothing was fitted
 # Residual relative to the motion that fits with secondary modes may leave: an actuator has more of
 # them, whose shares change with the stretch. Plans of modal then leave less than `_LEFT` of it,
 # and at order 3 less than `LEFT_AT_3` (benchmarks continuum).
-TOLERATED, _LEFT, LEFT_AT_3 = 0.15, 1.3, 0.3
+TOLERATED, _LEFT, LEFT_AT_3 = 0.15, 1.5, 0.3
 # Fraction of these residuals above which another departure explains them.
 _MOSTLY = 0.3
 # Wide ranges for soft actuators, in SI units, and the power of the time unit in each.
