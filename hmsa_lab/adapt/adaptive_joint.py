@@ -249,6 +249,7 @@ class AdaptiveJoint:
         wanted, *early = (x.flux_density for x in plan.levels[place:place + 2])
         if abs(flux_density) > self.largest:
             self.largest = math.inf
+        # The next level, if it takes effect early, is none of an amplifier that saturated.
         if wanted and 0.0 < flux_density / wanted < 1.0 - _ROUNDED and not any(
                 math.isclose(flux_density, x, rel_tol=_ROUNDED) for x in early):
             self.largest = abs(flux_density)
