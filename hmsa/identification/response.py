@@ -43,7 +43,7 @@ _WARMING = {
 # Parameters that are values of theta, by index.
 _PLACES = {
     'coil_time_constant': places.LAG, 'initial_stretch': places.STRETCH,
-    'initial_rate': places.RATE, 'damping_exponent': places.GRADE,
+    'initial_rate': places.RATE, 'damping_exponent': places.EXPONENT,
     **{x: places.FIRST_BRANCH + places.BRANCH * i + j
        for i, z in enumerate(quantities.BRANCHES) for j, x in enumerate(z)},
     **{x: places.FIRST_BRANCH + places.BRANCH * i + places.FLOW_CONSTANT + j

@@ -426,9 +426,9 @@ bool respond_gent(const Recorded &of, int from)
     if (!__builtin_cpu_supports("avx2"))
         return respond_as<Eight, Block<Eight, Gent>>(of, from);
     // The most common case of identification has its own code.
-    if (of.branches == 0 && of.modes == 0 && !of.graded() && of.wanted_count - from <= 4)
+    if (of.branches == 0 && of.modes == 0 && !of.damping_varies() && of.wanted_count - from <= 4)
         return respond_wide<Dual<four, 1>, 0>(of, from);
-    if (of.branches == 1 && of.modes == 0 && !of.graded() && of.theta[first_branch + 2] == maxwell)
+    if (of.branches == 1 && of.modes == 0 && !of.damping_varies() && of.theta[first_branch + 2] == maxwell)
         return respond_wide<Dual<four, 2>, 1>(of, from);
     return respond_wide<Dual<four, 2>, most_branches>(of, from);
 }

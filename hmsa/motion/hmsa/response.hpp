@@ -13,7 +13,7 @@ namespace hmsa {
 // Beyond all indices, constant i of the hyperelastic model is the first plus i, and the start time
 // of piece m the second plus m. Two forces that are zero in every motion only serve
 // differentiation: one against the motion at any rate, and one with the square of the rate.
-enum Theta { stiffness_of, damping_of, drive_of, force_of, lag_of, stretch_of, rate_of, grade_of, first_branch };
+enum Theta { stiffness_of, damping_of, drive_of, force_of, lag_of, stretch_of, rate_of, exponent_of, first_branch };
 constexpr int branch_places = 3 + flow_constants, mode_places = 5;
 constexpr int friction_of = 400, square_of = 401, constant_of = 500, switch_of = 1000;
 // Rate, relative to the fastest frequency, over which the friction changes sign.
@@ -44,12 +44,12 @@ struct Recorded {
     // null for zero, and if not needed.
     const double *behind;
     double *behind_last;
-    bool graded() const  // whether the damping changes with the stretch
+    bool damping_varies() const  // whether the damping changes with the stretch
     {
         for (int j = 0; j < wanted_count; j++)
-            if (wanted[j] == grade_of)
+            if (wanted[j] == exponent_of)
                 return true;
-        return theta[grade_of] != 0;
+        return theta[exponent_of] != 0;
     }
     bool by_constants() const
     {
@@ -132,8 +132,8 @@ template <class C, class System, int NB = most_branches> struct Response {
     Response(const Recorded &recorded, int first) : of(recorded), from(first) { step.use(width); }
     System system;
     typename System::Bare bare;  // the system without derivatives
-    S a, damping, drive, force, lag, grade;
-    bool graded;  // whether the damping changes with the stretch
+    S a, damping, drive, force, lag, exponent;
+    bool damping_varies;  // whether the damping changes with the stretch
     Branches<NB, S> branches;
     Branches<NB> bare_branches;
     std::conditional_t<modal, Modal<S>, char> modes{};
@@ -168,8 +168,8 @@ template <class C, class System, int NB = most_branches> struct Response {
                     system.seed(wanted - constant_of, j);
             });
         a = seeded_at(stiffness_of), damping = seeded_at(damping_of), drive = seeded_at(drive_of);
-        force = seeded_at(force_of), lag = seeded_at(lag_of), grade = seeded_at(grade_of);
-        graded = modal && bare.rest > 0 && of.graded();
+        force = seeded_at(force_of), lag = seeded_at(lag_of), exponent = seeded_at(exponent_of);
+        damping_varies = modal && bare.rest > 0 && of.damping_varies();
         rubs = squares = -1;
         each([&](int j, int wanted) {
             rubs = wanted == friction_of ? j : rubs;
@@ -223,10 +223,10 @@ template <class C, class System, int NB = most_branches> struct Response {
                 incline(pull, squares, slope(pull, squares) - abs(v) * v);
         }
         by[0] = x[1];
-        [[maybe_unused]] S net{}, less{};  // less: by which the damping is below that at rest
+        [[maybe_unused]] S net{}, relief{};  // relief: by which the damping is below that at a stretch of 1
         if constexpr (modal)
-            if (graded && first(x[0]) > 0)
-                pull = pull + (less = damping * (S{} + 1.0 - power(x[0], grade)) * x[1]);
+            if (damping_varies && first(x[0]) > 0)
+                pull = pull + (relief = damping * (S{} + 1.0 - power(x[0], exponent)) * x[1]);
         by[1] = system.acceleration(x[0], x[1], damping, [&](const S &elastic)
             __attribute__((always_inline)) {
                 S held = elastic;
@@ -234,7 +234,7 @@ template <class C, class System, int NB = most_branches> struct Response {
                     __attribute__((always_inline)) { held = held + more; });
                 const S beyond = pull - a * held;
                 if constexpr (modal)
-                    net = beyond - less;
+                    net = beyond - relief;
                 return beyond;
             });
         if constexpr (modal)
