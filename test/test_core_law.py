@@ -18,7 +18,7 @@ from hmsa.model.equations import (
 from hmsa.model.parameters import NondimensionalParameters
 from hmsa.model.simulation import simulate
 from hmsa.model.status import Code
-from hmsa.motion.theta import CONSTANT
+from hmsa.motion.theta import CONSTANT, DRIVE, FIRST_BRANCH, STIFFNESS
 from hmsa.planning.two_step import Groups, plan_two_step, plan_two_step_batch
 
 NEO_HOOKEAN = NondimensionalParameters(j_lim=math.inf)
@@ -75,7 +75,8 @@ def test_the_slope_of_the_force_by_the_chain_limit_is_that_of_finite_differences
     high, low = (
         law.elastic_force(stretch, law.pack(0.3, 1.0 / (0.2 + x), 1.4)) for x in (1e-6, -1e-6))
     material, slope = law.pack(0.3, 5.0, 1.4), np.empty(1)
-    theta = np.array([1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0])
+    theta = np.zeros(FIRST_BRANCH)
+    theta[[STIFFNESS, DRIVE]] = 1.0
     held = motion.rest(
         theta, material, law.elastic_force(stretch, material), np.array([CONSTANT]), slope)
     assert held == pytest.approx(stretch, rel=1e-14)
