@@ -9,7 +9,7 @@ from time import monotonic
 import tty
 
 _POLL = 0.005
-# From this time in s on, between two looks at the line, the host halted the board.
+# Time in s between two looks at the line from which on the host halted the board: ten polls.
 _HALT = 0.05
 
 

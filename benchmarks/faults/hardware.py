@@ -320,7 +320,7 @@ def _stalled(rig: Rig, who: str, latest: float) -> Seen:
             'lead_time': PATIENT_LEAD})}
         bench.ready()
         rig.ready('planner')
-        _switch_on(bench, lambda: rig.sequence([(x, 0.3) for x in (1.1, 1.2, 1.3) * 4]))
+        _move_until_on(bench, lambda: rig.sequence([(x, 0.3) for x in (1.1, 1.2, 1.3) * 4]))
         rig.spin(0.5)
         begin = monotonic()
         processes[who].send(signal.SIGSTOP)
@@ -332,13 +332,13 @@ def _stalled(rig: Rig, who: str, latest: float) -> Seen:
         off, halted = bench.board.off_since(begin), bench.board.halted_since(begin)
         rig.spin(1.0)
         again = bench.board.largest_since(begin + off)
-        _switch_on(bench, lambda: rig.setpoint(1.1))
+        _move_until_on(bench, lambda: rig.setpoint(1.1))
         return Seen(
             f'{again:g} T before the next request', f'off after {off:.2f} s',
             not again and off < latest + halted)
 
 
-def _switch_on(bench: _Bench, request: Callable[[], object]) -> None:
+def _move_until_on(bench: _Bench, request: Callable[[], object]) -> None:
     """Request motion until the coil is on: a busy host may stop a process for as long."""
     request()
 
