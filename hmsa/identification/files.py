@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 import yaml
@@ -20,7 +20,6 @@ from hmsa.errors import BadInputError
 from hmsa.files import yaml_text
 from hmsa.identification import quantities
 from hmsa.identification.quantities import Known, PREFIX
-from hmsa.identification.result import Identification
 from hmsa.interfaces.actuator import actuator_from, parameters_of, thermal_from
 from hmsa.interfaces.parameters import BLOCK, number_of
 from hmsa.interfaces.topics import PLANNER, PLANT
@@ -29,6 +28,9 @@ from hmsa.model.mismatch import Ellipsoid, Uncertainty
 from hmsa.model.parameters import ActuatorParameters
 from hmsa.planning.shapers.request import as_errors, LARGEST_ERROR
 from hmsa.runs.parameters import Entries, entries_of, values_of
+
+if TYPE_CHECKING:  # slow to import, and not needed by nodes
+    from hmsa.identification.result import Identification
 
 # Parameters of coil and sensor, with their names in parameter files.
 _OTHERS = (
@@ -171,7 +173,7 @@ def _number(path: Path | None, name: str, value: object) -> float:
     return number
 
 
-def file_text(found: Identification, belief: Belief, run: str, now: datetime) -> str:
+def file_text(found: 'Identification', belief: Belief, run: str, now: datetime) -> str:
     """
     Return the parameter file of an identification; ``run`` names the recording in comments.
 
@@ -250,7 +252,7 @@ def known_lines(known: Known, joint: str = '') -> list[str]:
         *(f'    {joint}{key}: {yaml_text(x)}' for key, x in known.parameters().items())]
 
 
-def _line(key: str, value: Any, found: Identification, *names: str) -> str:
+def _line(key: str, value: Any, found: 'Identification', *names: str) -> str:
     """Return the line of a value, with standard deviations and intervals of its estimates."""
     line, notes = f'    {key}: {yaml_text(value)}', []
     for name in names:

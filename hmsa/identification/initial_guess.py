@@ -11,7 +11,6 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 import math
-from statistics import median
 from typing import Any
 
 import numpy as np
@@ -124,12 +123,12 @@ def static(
     rests = []
     for begin, end, when, level in segments(recording, 1):
         tail = recording.stretch[begin + (end - begin) * 2 // 3:end]
-        rests.append((when, level, median(tail.tolist())))
+        rests.append((when, level, float(np.median(tail))))
     # Take the median of each level: at the end of short ones, the motion still vibrates.
     fields = np.unique([x[1] for x in rests])
     if len(fields) < 2:
         return Static(math.nan, usual, tuple(rests))
-    stretch = np.array([median(x for _, level, x in rests if level == y) for y in fields])
+    stretch = np.array([np.median([x for _, level, x in rests if level == y]) for y in fields])
     low, high = float(np.min(recording.stretch)), float(np.max(recording.stretch))
     best = (math.inf, math.nan, usual)
     group = quantities.group_of(values)

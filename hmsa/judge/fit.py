@@ -10,7 +10,6 @@ joints judges several hundred times a second.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from statistics import NormalDist
 from typing import NamedTuple
 
 from hmsa.judge import _ringing
@@ -19,8 +18,7 @@ from hmsa.model.equations import Array
 #: Fewer samples do not determine the vibration.
 FEWEST = 8
 # Probability that the true value is beyond a bound, and the quantile of normal noise for it.
-_BEYOND = 0.005
-_NORMAL = NormalDist().inv_cdf(1.0 - _BEYOND)
+_BEYOND, _NORMAL = 0.005, 2.5758293035489
 #: Fraction of independent samples below which what remains is no noise, and creep is tried.
 INDEPENDENT = 0.4
 #: Highest mode that may ring, relative to the frequency of the model.

@@ -4,7 +4,7 @@ Drafts: requests planned without changing the running plan.
 Each function calls ``check`` after a bounded amount of work, which abandons the draft by raising.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 import math
@@ -16,6 +16,7 @@ from hmsa.errors import BadInputError
 from hmsa.model.moves import check_target, Level, Move, Setpoint, State
 from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import NANOSECONDS
+from hmsa.planning import Check, proceed
 from hmsa.planning.history import agree
 from hmsa.planning.path import along, ON_PATH, Path
 from hmsa.planning.sequence import Segment, segments
@@ -28,8 +29,6 @@ from hmsa.planning.warmth import Warmth
 
 #: Stretch, rate in 1/s and acceleration in 1/s^2; the acceleration is NaN if not given.
 PathPoint = tuple[float, float, float]
-#: Called after each bounded amount of work; raises to abandon it.
-Check = Callable[[], None]
 
 # Fractions of the hardest braking to try, in this order, if that leads to no plan.
 _BRAKE_SHARES = (0.5, 0.1, 0.02, 0.0)
@@ -46,10 +45,6 @@ _BACK = 0.4
 _ANEW = 1e-4
 # Setpoints between two checks, in about 0.1 ms; levels take longer.
 _CHECKED = 200
-
-
-def proceed() -> None:
-    """Go on, as a `Check` that abandons nothing."""
 
 
 @dataclass(frozen=True)

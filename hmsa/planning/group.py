@@ -13,7 +13,7 @@ import math
 from typing import Any
 
 from hmsa.model.status import RefusedError
-from hmsa.planning.drafting import Check, proceed
+from hmsa.planning import Check, proceed
 from hmsa.planning.history import Deviation
 from hmsa.planning.planner import Planner
 from hmsa.planning.timeline import Draft, PlannedSegment, Timeline

@@ -17,8 +17,8 @@ from hmsa.model.moves import check_target, Setpoint
 from hmsa.model.parameters import ActuatorParameters
 from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import NANOSECONDS
-from hmsa.planning import drafting
-from hmsa.planning.drafting import Check, PathPoint, PlanStart, proceed
+from hmsa.planning import Check, drafting, proceed
+from hmsa.planning.drafting import PathPoint, PlanStart
 from hmsa.planning.given_levels import check_levels, draft_levels
 from hmsa.planning.running import RunningPlan
 from hmsa.planning.timeline import Draft, JointModel, Options, PlannedLevel, Timeline

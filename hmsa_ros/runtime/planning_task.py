@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from itertools import count
 from typing import Any, NamedTuple
 
-from hmsa.planning.drafting import Check
+from hmsa.planning import Check
 from hmsa.planning.planner import Planner
 from hmsa.planning.timeline import Draft
 from hmsa_ros.runtime.records import Request, Trajectory, Verdict

@@ -10,12 +10,12 @@ from hmsa.interfaces.outcome import Outcome
 from hmsa.judge.records import Finding, GoalTolerances, Tolerances
 from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import NANOSECONDS
-from hmsa.planning.group import Progress
 from hmsa_ros.runtime.worker import Inline, Worker
 from hmsa_ros.timekeeping import steady_ns
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # slow to import, and not needed by all nodes
     from hmsa.identification.quantities import Known
+    from hmsa.planning.group import Progress
 
 #: How velocities in a trajectory are treated: refused, as it rests at each point, or as a path.
 TRAJECTORY_MODES = ('rest', 'path')
@@ -216,8 +216,8 @@ class StatusChanged:
     """A new verdict or a change in the progress."""
 
     verdict: Verdict
-    progress: Progress
-    each: Mapping[str, Progress]
+    progress: 'Progress'
+    each: Mapping[str, 'Progress']
     plan: int  # accepted requests so far
     late: int  # late commands
     replanned: int  # number of replannings

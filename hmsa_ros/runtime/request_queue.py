@@ -13,7 +13,7 @@ from typing import Any
 from hmsa.errors import BadInputError, HmsaError
 from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import NANOSECONDS
-from hmsa.planning.drafting import Check
+from hmsa.planning import Check
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.timeline import Draft, PlannedSegment
 from hmsa_ros.runtime.deviations import Deviations

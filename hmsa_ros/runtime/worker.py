@@ -9,7 +9,7 @@ import sys
 from threading import Condition, Thread
 from typing import Any, Protocol
 
-from hmsa.planning.drafting import Check, proceed
+from hmsa.planning import Check, proceed
 
 #: Work that calls its argument after each bounded piece.
 Work = Callable[[Check], Any]
