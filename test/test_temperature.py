@@ -271,7 +271,7 @@ def test_temperature_that_is_ignored_leaves_vibration_and_offset():
 
 
 @pytest.mark.parametrize(('stiffer', 'duration'), [
-    (0.0, 80.0), *(pytest.param(x, DURATION, marks=pytest.mark.slow) for x in (0.0, 0.1))])
+    (0.0, 60.0), *(pytest.param(x, DURATION, marks=pytest.mark.slow) for x in (0.0, 0.1))])
 def test_feedback_without_a_temperature_sensor_is_right_from_the_third_move_on(stiffer, duration):
     found = warming('feedback', stiffer=stiffer, duration=duration)[2:]
     assert max(x.vibration for x in found) < 5e-3
@@ -279,7 +279,7 @@ def test_feedback_without_a_temperature_sensor_is_right_from_the_third_move_on(s
 
 
 @pytest.mark.parametrize(('coefficients', 'expansion', 'duration'), [
-    (1.2, 3e-4, 80.0), *(
+    (1.2, 3e-4, 60.0), *(
         pytest.param(*x, DURATION, marks=pytest.mark.slow) for x in (
             (0.8, 0.0), (1.0, 3e-4)))])
 def test_feedback_with_a_temperature_sensor_corrects_coefficients_and_an_expanding_length(
