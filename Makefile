@@ -152,7 +152,7 @@ $(VENV)/.control_msgs: $(wildcard test/action_interfaces/* test/action_interface
 
 # The installation compiles the motion, too; this is for when its sources change.
 $(VENV)/.motion: $(wildcard hmsa/*.c hmsa_lab/bench/*.cpp \
-	hmsa_lab/bench/hmsa_board/*.hpp hmsa/judge/*.cpp hmsa/motion/*.cpp hmsa/motion/hmsa/*.hpp) | $(VENV)/.installed
+	hmsa_lab/bench/hmsa_board/*.hpp hmsa/judge/*.cpp hmsa/motion/*.[ch]pp hmsa/motion/hmsa/*.hpp) | $(VENV)/.installed
 	@test -e $@ && test -z "$$(find $^ -newer $@)" \
 	|| { echo "Compiling the motion"; $(BIN)/python scripts/narrate.py $(BIN)/python setup.py --quiet build_ext --inplace; }
 	@touch $@

@@ -114,10 +114,10 @@ COMPILED = [
     '-std=c++17', '-O2', '-ftree-vectorize', '-ffp-contract=off', '-fno-math-errno',
     '-fno-trapping-math', '-fvisibility=hidden', '-fno-exceptions', '-fno-rtti', '-Wno-psabi',
     '-g0']
-MOTION = Extension(
-    'hmsa.motion._motion', ['hmsa/motion/module.cpp'],
-    include_dirs=['hmsa/motion'], depends=sorted(glob('hmsa/motion/hmsa/*.hpp')),
-    language='c++', extra_compile_args=COMPILED)
+MOTION, DERIVATIVES = (Extension(
+    f'hmsa.motion._{x}', [f'hmsa/motion/{x}.cpp'], include_dirs=['hmsa/motion'],
+    depends=sorted(glob('hmsa/motion/**/*.hpp', recursive=True)), language='c++',
+    extra_compile_args=COMPILED) for x in ('motion', 'derivatives'))
 RINGING = Extension(
     'hmsa.judge._ringing', ['hmsa/judge/_ringing.cpp'], language='c++',
     extra_compile_args=COMPILED)
@@ -131,6 +131,11 @@ DEADLINE = Extension('hmsa._deadline', ['hmsa/_deadline.c'], extra_compile_args=
 
 class BuildMotion(build_ext):
     """Compiles from wherever setup.py runs, and says what is missing where it cannot."""
+
+    def finalize_options(self):
+        """Compile motion and derivatives at the same time, where there is more than one core."""
+        super().finalize_options()
+        self.parallel = True
 
     def build_extension(self, ext):
         """Build with absolute paths: colcon links to this file from a folder without sources."""
@@ -170,13 +175,13 @@ setup(
     package_data={
         'hmsa': [
             'py.typed', '*.pyi', 'cli/completion.[bfz]*', 'judge/*.pyi', 'motion/*.pyi',
-            'motion/hmsa/*.hpp', 'report/*.css', 'report/*.html', 'report/*.js',
+            'motion/*.hpp', 'motion/hmsa/*.hpp', 'report/*.css', 'report/*.html', 'report/*.js',
             'report/*.mplstyle'],
         'hmsa_ros': ['py.typed', '*.xml'],
         'hmsa_lab': [
             'py.typed', 'bench/*.html', 'bench/*.pyi', 'bench/hmsa_board/*', 'panel/index.html',
             'panel/panel.*']},
-    ext_modules=[MOTION, RINGING, BOARD, DEADLINE],
+    ext_modules=[MOTION, DERIVATIVES, RINGING, BOARD, DEADLINE],
     cmdclass={'build_ext': BuildMotion},
     data_files=[
         ('share/ament_index/resource_index/packages', ['resource/' + PACKAGE]),

@@ -7,7 +7,6 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from hmsa import motion
 from hmsa.model import law
 from hmsa.model.equations import (
     elastic_energy,
@@ -18,7 +17,7 @@ from hmsa.model.equations import (
 from hmsa.model.parameters import NondimensionalParameters
 from hmsa.model.simulation import simulate
 from hmsa.model.status import Code
-from hmsa.motion.theta import CONSTANT, DRIVE, FIRST_BRANCH, STIFFNESS
+from hmsa.motion.derivatives import CONSTANT, DRIVE, FIRST_BRANCH, rest, STIFFNESS
 from hmsa.planning.two_step import Groups, plan_two_step, plan_two_step_batch
 
 NEO_HOOKEAN = NondimensionalParameters(j_lim=math.inf)
@@ -77,7 +76,7 @@ def test_the_slope_of_the_force_by_the_chain_limit_is_that_of_finite_differences
     material, slope = law.pack(0.3, 5.0, 1.4), np.empty(1)
     theta = np.zeros(FIRST_BRANCH)
     theta[[STIFFNESS, DRIVE]] = 1.0
-    held = motion.rest(
+    held = rest(
         theta, material, law.elastic_force(stretch, material), np.array([CONSTANT]), slope)
     assert held == pytest.approx(stretch, rel=1e-14)
     # Where it is held moves as far as the force grows less.

@@ -22,7 +22,7 @@ from hmsa.identification.quantities import BRANCHES, quantity_of
 from hmsa.identification.response import respond
 from hmsa.identification.result import Defect
 from hmsa.model.equations import Array
-from hmsa.motion import theta as places
+from hmsa.motion import derivatives
 
 # Minimum size of a departure in standard deviations, together with a minimum fraction of the
 # residuals, or a minimum change of an estimate in standard deviations.
@@ -43,8 +43,8 @@ _PARAMETERS = {
     'coil_time_constant': 'lag of the coil', 'sensor_latency': 'latency of the sensor',
     GAIN: 'gain of the sensor', 'constant_force': 'constant force'}
 _FORCES = {
-    places.FRICTION: 'friction that does not depend on the rate',
-    places.SQUARE: 'damping by the square of the rate'}
+    derivatives.FRICTION: 'friction that does not depend on the rate',
+    derivatives.SQUARE: 'damping by the square of the rate'}
 
 
 class Departure(NamedTuple):

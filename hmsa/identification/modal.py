@@ -28,7 +28,7 @@ from hmsa.identification.result import Mode
 from hmsa.model import equations
 from hmsa.model.equations import Array
 from hmsa.model.laws.record import BEAMS
-from hmsa.motion import theta as places
+from hmsa.motion import derivatives
 
 #: Minimum ratio to the frequency of the first mode.
 LEAST_RATIO = 1.1
@@ -229,9 +229,9 @@ class _Modes:
         fields, which = np.unique(levels, return_inverse=True)
         sparse = fields if len(fields) < 100 else np.linspace(fields[0], fields[-1], 100)
         nothing: Array = np.empty(0)
-        held = np.array([motion.rest(
+        held = np.array([derivatives.rest(
             setup.theta, setup.material, float(x), setup.wanted, nothing) for x in sparse])
-        pace = math.sqrt(float(setup.theta[places.STIFFNESS])) * np.array([
+        pace = math.sqrt(float(setup.theta[derivatives.STIFFNESS])) * np.array([
             motion.natural_frequency(float(x), setup.material) for x in held])
         if sparse is not fields:
             held, pace = (np.interp(fields, sparse, x) for x in (held, pace))

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hmsa import motion
 from hmsa.errors import BadInputError
 from hmsa.identification import quantities
 from hmsa.identification.measurement import Measurement, pieces, UncheckedMeasurement
@@ -20,8 +19,7 @@ from hmsa.model.laws.record import Elastic, GENT
 from hmsa.model.parameters import Geometry
 from hmsa.model.thermal import Thermal
 from hmsa.model.units import MU_0
-from hmsa.motion import SPEED
-from hmsa.motion import theta as places
+from hmsa.motion import derivatives, SPEED
 
 #: Relative tolerance of the integration: far below the noise of any sensor.
 RTOL = 1e-8
@@ -33,20 +31,20 @@ _SENSOR = (
     'stretch_bias', 'stretch_gain', 'sensor_latency', quantities.WARMING, quantities.EXPANSION)
 # Parameters to which values of theta are proportional, by index.
 _LINEAR = {
-    'shear_modulus': places.STIFFNESS, 'damping_coefficient': places.DAMPING,
-    'remanence': places.DRIVE, 'constant_force': places.FORCE}
+    'shear_modulus': derivatives.STIFFNESS, 'damping_coefficient': derivatives.DAMPING,
+    'remanence': derivatives.DRIVE, 'constant_force': derivatives.FORCE}
 # By coefficient of the temperature: the value of theta that changes, and the power of it; a lag
 # is L/R.
 _WARMING = {
-    'shear_modulus': (places.STIFFNESS, 1), 'damping_coefficient': (places.DAMPING, 1),
-    'remanence': (places.DRIVE, 1), 'coil_resistance': (places.LAG, -1)}
+    'shear_modulus': (derivatives.STIFFNESS, 1), 'damping_coefficient': (derivatives.DAMPING, 1),
+    'remanence': (derivatives.DRIVE, 1), 'coil_resistance': (derivatives.LAG, -1)}
 # Parameters that are values of theta, by index.
 _PLACES = {
-    'coil_time_constant': places.LAG, 'initial_stretch': places.STRETCH,
-    'initial_rate': places.RATE, 'damping_exponent': places.EXPONENT,
-    **{x: places.FIRST_BRANCH + places.BRANCH * i + j
+    'coil_time_constant': derivatives.LAG, 'initial_stretch': derivatives.STRETCH,
+    'initial_rate': derivatives.RATE, 'damping_exponent': derivatives.EXPONENT,
+    **{x: derivatives.FIRST_BRANCH + derivatives.BRANCH * i + j
        for i, z in enumerate(quantities.BRANCHES) for j, x in enumerate(z)},
-    **{x: places.FIRST_BRANCH + places.BRANCH * i + places.FLOW_CONSTANT + j
+    **{x: derivatives.FIRST_BRANCH + derivatives.BRANCH * i + derivatives.FLOW_CONSTANT + j
        for i, z in enumerate(quantities.FLOWING) for j, x in enumerate(z)}}
 
 
@@ -80,9 +78,9 @@ def _chain(
     per_damping = 0.5 * geometry.c1 * geometry.half_length / geometry.damped / inertia
     per_force = 1.0 / (geometry.loaded * inertia)
     modes = quantities.modes_of(values, free)
-    first = places.FIRST_BRANCH + places.BRANCH * branches
-    theta = np.zeros(first + places.MODE * len(modes))
-    theta[:places.LAG] = (
+    first = derivatives.FIRST_BRANCH + derivatives.BRANCH * branches
+    theta = np.zeros(first + derivatives.MODE * len(modes))
+    theta[:derivatives.LAG] = (
         a, per_damping * values['damping_coefficient'], k, per_force * values['constant_force'])
     by_value = dict(zip(
         _LINEAR.values(), (a / modulus, per_damping, k / remanence, per_force), strict=True))
@@ -91,10 +89,10 @@ def _chain(
     if 'creep' in values:
         rows = np.array(values['creep'].rows())
         rows[:, SPEED] = values['creep'].times
-        theta[places.FIRST_BRANCH:first] = rows[:, :places.BRANCH].ravel()
+        theta[derivatives.FIRST_BRANCH:first] = rows[:, :derivatives.BRANCH].ravel()
     else:
-        theta[places.FIRST_BRANCH + places.FLOW:first:places.BRANCH] = quantities.flow_of(
-            values, free).kind
+        flow = slice(derivatives.FIRST_BRANCH + derivatives.FLOW, first, derivatives.BRANCH)
+        theta[flow] = quantities.flow_of(values, free).kind
     warming = _warmed(values, theta, by_value)
     per_density = {i: -float(theta[i]) / density for i in _LINEAR.values()}
     aside = differenced(values, free)
@@ -119,11 +117,11 @@ def _chain(
         elif name in aside:
             continue
         elif name == 'chain_limit':
-            chain[name] = {places.CONSTANT: -1.0 / values[name] ** 2}
+            chain[name] = {derivatives.CONSTANT: -1.0 / values[name] ** 2}
         elif name not in _SENSOR:
             constant, i = quantities.constants_of(values['law'])[name]
             # The scale of the model stays: constants in Pa change its force in proportion.
-            chain[name] = {places.CONSTANT + constant.place + 2 * i: (
+            chain[name] = {derivatives.CONSTANT + constant.place + 2 * i: (
                 1.0 / values['shear_modulus'] if constant.unit == 'Pa' else 1.0)}
     return theta, chain
 
@@ -185,7 +183,7 @@ def _packed(limit: float, c1: float, law: Elastic | None) -> Array:
 class ResponseArguments:
     """Arguments of the motion for some values, and the chain rule to the free parameters."""
 
-    theta: Array  # with indices as in `hmsa.motion.theta`
+    theta: Array  # with indices as in `hmsa.motion.derivatives`
     material: Array  # the packed material
     branches: int  # number of viscoelastic branches
     # Indices in theta, or of constants of the model, to differentiate by, shape (w,).
@@ -259,18 +257,19 @@ def respond(
     if len(uncertain) and free:
         # Steps: a piece begins with each level.
         place = np.searchsorted(begins, level_times[uncertain])
-        wanted = np.append(wanted, places.SWITCH + place)
+        wanted = np.append(wanted, derivatives.SWITCH + place)
     start = np.zeros(len(wanted))
     if recording.at_rest:
-        theta[places.STRETCH] = motion.rest(theta, material, float(levels[0]), wanted, start)
-        theta[places.RATE] = 0.0
-        if math.isnan(theta[places.STRETCH]):
+        theta[derivatives.STRETCH] = derivatives.rest(
+            theta, material, float(levels[0]), wanted, start)
+        theta[derivatives.RATE] = 0.0
+        if math.isnan(theta[derivatives.STRETCH]):
             return None
     else:
-        start[wanted == places.STRETCH] = 1.0
+        start[wanted == derivatives.STRETCH] = 1.0
     n = len(times)
     stretch, rate, raw = np.empty(n), np.empty(n), np.empty((n, len(wanted)))
-    if not motion.respond(
+    if not derivatives.respond(
             theta, material, setup.branches, wanted, start, begins, levels, slopes,
             float(levels[0]), 0.0, times, rtol, stretch, rate, raw, _NOTHING, _NOTHING, _NOTHING):
         return None

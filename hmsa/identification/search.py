@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from hmsa import motion
 from hmsa.errors import BadInputError
 from hmsa.identification import diagnosis, quantities
 from hmsa.identification.fit import Fit, fit, loss, robust_scale
@@ -21,6 +20,7 @@ from hmsa.identification.response import (
     sensed,
 )
 from hmsa.model.equations import Array
+from hmsa.motion import derivatives
 
 # Ratio of residuals to their increments up to which they are white enough for a first check.
 _NEAR_WHITE = 1.5
@@ -188,7 +188,7 @@ def unmoved(best: Fit) -> set[str]:
     rests: Array = np.empty(len(levels))
     slopes: Array = np.empty((len(levels), len(setup.wanted)))
     for i, level in enumerate(levels.tolist()):
-        rests[i] = motion.rest(setup.theta, setup.material, level, setup.wanted, slopes[i])
+        rests[i] = derivatives.rest(setup.theta, setup.material, level, setup.wanted, slopes[i])
     if not np.all(np.isfinite(rests)):
         return set()
     rests, by = sensed(
@@ -197,7 +197,7 @@ def unmoved(best: Fit) -> set[str]:
 
     def rests_at(other: Mapping[str, Any]) -> Array | None:
         setup = ResponseArguments.of(quantities.complete(other, ()), ())
-        found = np.array([motion.rest(
+        found = np.array([derivatives.rest(
             setup.theta, setup.material, x, setup.wanted, np.empty(0)) for x in levels.tolist()])
         return values['stretch_gain'] * found if np.all(np.isfinite(found)) else None
 

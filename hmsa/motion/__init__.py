@@ -1,8 +1,9 @@
 """
 The equation of motion, compiled when the package is built: C++ templates over any scalar type.
 
-``hmsa/*.hpp`` do not use Python and allocate no memory; ``module.cpp`` binds them. All quantities
-are dimensionless except in `respond`, and values are not checked: callers do that.
+``hmsa/*.hpp`` do not use Python and allocate no memory; ``motion.cpp`` and ``derivatives.cpp``
+bind them. All quantities are dimensionless except in `hmsa.motion.derivatives`, and values are
+not checked: callers do that.
 """
 
 from hmsa.motion._motion import (
@@ -18,8 +19,6 @@ from hmsa.motion._motion import (
     follow,
     mass,
     natural_frequency,
-    respond,
-    rest,
     sample,
     smooth,
     solve,
@@ -35,7 +34,7 @@ from hmsa.motion._motion import (
 __all__ = [
     'accelerations', 'critical_zeta', 'damping', 'elastic_energy', 'elastic_force',
     'elastic_stiffness', 'equilibrium_stretch', 'evaluate', 'flow_rates', 'follow',
-    'mass', 'natural_frequency', 'respond', 'rest', 'sample', 'smooth', 'solve', 'staircase',
+    'mass', 'natural_frequency', 'sample', 'smooth', 'solve', 'staircase',
     'subsets', 'trail', 'turning_point', 'two_step', 'two_step_batch', 'two_step_late']
 
 #: Statuses of a turning point: found; approach to an equilibrium instead; out of steps; too close

@@ -56,17 +56,6 @@ def trail(times: Array, forces: Array, branches: Array, out: Array, /) -> bool: 
 def staircase(
     behind: Array, branches: Array, stretch: float, material: Array, lag: float, period: float,
     end: float, ripple: float, out: Array, /) -> tuple[int, float]: ...
-# Whether the motion was followed to its end.
-def respond(
-    theta: Array, material: Array, branches: int, wanted: NDArray[np.int64], start: Array,
-    begins: Array, levels: Array, ramps: Array, field: float, field_lag: float, times: Array,
-    rtol: float, stretch: Array, rate: Array, jacobian: Array, by_rate: Array, behind: Array,
-    behind_last: Array, /
-) -> bool: ...
-# Return the equilibrium stretch under a level; NaN if there is none.
-def rest(
-    theta: Array, material: Array, level: float, wanted: NDArray[np.int64], slopes: Array, /
-) -> float: ...
 # Solve for each subset of the unknowns, in place; compute the logarithms of the determinants.
 def subsets(
     matrix: Array, varies: NDArray[np.bool_], values: Array, log_dets: Array, /) -> None: ...

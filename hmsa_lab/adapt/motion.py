@@ -12,9 +12,7 @@ from hmsa.identification.response import ResponseArguments
 from hmsa.model.delivery import late
 from hmsa.model.equations import Array
 from hmsa.model.law import elastic_force, natural_frequency
-from hmsa.motion import respond
-from hmsa.motion import rest as motion_rest
-from hmsa.motion import theta as places
+from hmsa.motion import derivatives
 
 # Relative tolerance: far below the noise of a sensor.
 _RTOL = 1e-7
@@ -66,13 +64,13 @@ def follow(
     relaxed. Earlier levels count if the field lags. Return None if the motion meets the limits
     of the chains.
     """
-    setup = ResponseArguments.of(values, free, (places.STRETCH, places.RATE))
+    setup = ResponseArguments.of(values, free, (derivatives.STRETCH, derivatives.RATE))
     theta, wanted = setup.theta, setup.wanted
-    theta[places.STRETCH], theta[places.RATE] = state
+    theta[derivatives.STRETCH], theta[derivatives.RATE] = state
     start = np.zeros(len(wanted))
     start[-2] = 1.0
     starts, heights, slopes = pieces(levels.times, levels.values, levels.slew_limit, begin)
-    lag = float(theta[places.LAG])
+    lag = float(theta[derivatives.LAG])
     field, field_lag = float(heights[0]), 0.0
     if lag > 0.0:
         field = levels.field(begin, lag)
@@ -85,7 +83,7 @@ def follow(
     raw, raw_rate = np.empty((n, len(wanted))), np.empty((n, len(wanted)))
     behind = np.array(values.get('behind') or (0.0,) * setup.branches)
     behind_last = np.zeros(setup.branches)
-    if not respond(
+    if not derivatives.respond(
             theta, setup.material, setup.branches, wanted, start, starts, heights, slopes, field,
             field_lag, times, _RTOL, stretch, rate, raw, raw_rate, behind, behind_last):
         return None
@@ -110,8 +108,8 @@ def held(
     if not by:
         return rest(values, (), level)
     theta = ResponseArguments.of(values, ()).theta
-    a, k, f = theta[[places.STIFFNESS, places.DRIVE, places.FORCE]]
-    ratios = theta[places.FIRST_BRANCH::places.BRANCH].tolist()
+    a, k, f = theta[[derivatives.STIFFNESS, derivatives.DRIVE, derivatives.FORCE]]
+    ratios = theta[derivatives.FIRST_BRANCH::derivatives.BRANCH].tolist()
     pull = k * level + f + a * sum(x * y for x, y in zip(ratios, by, strict=True))
     found = rest(values, (), float((pull / (1.0 + sum(ratios)) - f) / k))
     return found and (found[0], found[1] * math.sqrt(1.0 + sum(ratios)), found[2])
@@ -128,9 +126,9 @@ def rest(
     """
     setup = ResponseArguments.of(values, free)
     slopes = np.zeros(len(setup.wanted))
-    stretch = motion_rest(setup.theta, setup.material, level, setup.wanted, slopes)
+    stretch = derivatives.rest(setup.theta, setup.material, level, setup.wanted, slopes)
     if math.isnan(stretch):
         return None
-    frequency = math.sqrt(setup.theta[places.STIFFNESS]) * float(
+    frequency = math.sqrt(setup.theta[derivatives.STIFFNESS]) * float(
         natural_frequency(stretch, setup.material))
     return stretch, frequency, slopes @ setup.mixing

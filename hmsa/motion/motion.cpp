@@ -1,165 +1,13 @@
-// Python bindings of the motion: functions over numbers and buffers, which do not check values.
-// `bound` converts their arguments and results.
-#define PY_SSIZE_T_CLEAN
-#include <Python.h>
-#include <tuple>
-#ifdef __SSE2__
-#include <xmmintrin.h>
-#endif
+// Functions of the motion, which do not check values.
+#include "bind.hpp"
 #include "hmsa/batch.hpp"
 #include "hmsa/late.hpp"
-#include "hmsa/response.hpp"
 #include "hmsa/smooth.hpp"
 #include "hmsa/subsets.hpp"
 #include "hmsa/tail.hpp"
 
 namespace {
 using namespace hmsa;
-using GentBlock = Block<double, Gent>;
-
-// Calls f with the actuator type of a packed material.
-template <class F> auto with_system(const double *m, const F &f)
-{
-    if (int(m[kind_at]) > neo_hookean) {
-        Any system;
-        system.read(0, m);
-        return f(system);
-    }
-    GentBlock system;
-    system.read(0, m);
-    return f(system);
-}
-template <int n> constexpr std::integral_constant<int, n> fixed{};
-
-// Flushes subnormal numbers to 0 while it exists. Decaying values, such as branches, the field of a
-// coil and their derivatives, become subnormal, which is ten times slower on x86.
-class Flushed {
-#ifdef __SSE2__
-    const unsigned before = _mm_getcsr();
-
-public:
-    Flushed() { _mm_setcsr(before | 0x8040); }  // results, operands
-    ~Flushed() { _mm_setcsr(before); }
-#endif
-};
-
-// -- arguments and results -----------------------------------------------------------------------
-
-// A contiguous array owned by the caller.
-template <class T> struct Array {
-    T *data;
-    int count;
-    T &operator[](int i) const { return data[i]; }
-};
-using Numbers = Array<const double>;
-using Results = Array<double>;
-using Places = Array<const int64_t>;
-using Statuses = Array<int64_t>;
-
-template <class T> struct Argument;
-template <> struct Argument<double> {
-    double got;
-    bool read(PyObject *from)
-    {
-        got = PyFloat_AsDouble(from);
-        return got != -1 || !PyErr_Occurred();
-    }
-};
-template <> struct Argument<int> {
-    int got;
-    bool read(PyObject *from)
-    {
-        got = int(PyLong_AsLong(from));
-        return got != -1 || !PyErr_Occurred();
-    }
-};
-// Released at the end.
-template <class T> struct Argument<Array<T>> {
-    Py_buffer view{};
-    Array<T> got{};
-    bool read(PyObject *from)
-    {
-        using Number = std::remove_const_t<T>;
-        constexpr bool numbers = std::is_same_v<Number, double>, truth = std::is_same_v<Number, bool>;
-        constexpr const char *types = numbers ? "d" : truth ? "?" : "lq";
-        constexpr int writable = std::is_const_v<T> ? 0 : PyBUF_WRITABLE;
-        if (PyObject_GetBuffer(from, &view, PyBUF_C_CONTIGUOUS | PyBUF_FORMAT | writable) != 0)
-            return false;
-        if (!std::strchr(types, view.format[0])) {
-            PyErr_Format(PyExc_TypeError, "array of type %s: expected one of %s", view.format, types);
-            return false;
-        }
-        got = {static_cast<T *>(view.buf), int(view.len / Py_ssize_t(sizeof(T)))};
-        return true;
-    }
-    Argument() = default;
-    Argument(const Argument &) = delete;
-    ~Argument() { PyBuffer_Release(&view); }
-};
-// The states of the branches, or nothing.
-struct Followed {
-    double values[most_branches];
-    int count;
-};
-template <> struct Argument<Followed> {
-    Followed got;
-    bool read(PyObject *from)
-    {
-        got.count = int(PyTuple_Size(from));
-        for (int b = 0; b < got.count && b < most_branches; b++)
-            got.values[b] = PyFloat_AsDouble(PyTuple_GET_ITEM(from, b));
-        return !PyErr_Occurred();
-    }
-};
-bool fit(bool is)
-{
-    if (!is)
-        PyErr_SetString(PyExc_ValueError, "expected arrays that fit each other");
-    return is;
-}
-
-PyObject *made(double x) { return PyFloat_FromDouble(x); }
-PyObject *made(int x) { return PyLong_FromLong(x); }
-PyObject *made(bool x) { return PyBool_FromLong(x); }
-struct Nothing {};
-PyObject *made(Nothing) { Py_RETURN_NONE; }
-template <class... T> PyObject *made(const std::tuple<T...> &all)
-{
-    PyObject *out = PyTuple_New(sizeof...(T));
-    int i = 0;
-    std::apply([&](const T &...x) { (PyTuple_SET_ITEM(out, i++, made(x)), ...); }, all);
-    return out;
-}
-template <class R, class... A, size_t... I> PyObject *call(
-    R (*f)(A...), PyObject *const *from, Py_ssize_t count, std::index_sequence<I...>)
-{
-    if (count != sizeof...(A))
-        return PyErr_Format(PyExc_TypeError, "expected %zu arguments, got %zd", sizeof...(A), count);
-    std::tuple<Argument<A>...> arguments;
-    if (!(std::get<I>(arguments).read(from[I]) && ...))
-        return nullptr;
-    const R result = [&] {
-        [[maybe_unused]] const Flushed flushed;
-        return f(std::get<I>(arguments).got...);
-    }();
-    return PyErr_Occurred() ? nullptr : made(result);
-}
-template <class R, class... A> PyObject *call(R (*f)(A...), PyObject *const *from, Py_ssize_t count)
-{
-    return call(f, from, count, std::index_sequence_for<A...>{});
-}
-template <auto f> PyObject *bound(PyObject *, PyObject *const *arguments, Py_ssize_t count)
-{
-    return call(f, arguments, count);
-}
-// Releases the interpreter lock during work.
-template <class F> auto apart(const F &f)
-{
-    PyThreadState *state = PyEval_SaveThread();
-    const auto result = f();
-    PyEval_RestoreThread(state);
-    return result;
-}
 
 // -- hyperelastic models ---------------------------------------------------------------------------
 
@@ -407,93 +255,7 @@ std::tuple<int, double> staircase(Numbers behind, Numbers branches, double stret
     return {found, most};
 }
 
-// -- recordings --------------------------------------------------------------------------------------
-
-using Eight = Dual<double, 8>;
-template <class S, class System, int NB = most_branches> bool respond_as(const Recorded &of, int from)
-{
-    Response<S, System, NB> response{of, from};
-    return response();
-}
-// As for a batch: one source, two instruction sets.
-template <class S, int NB> __attribute__((target("avx2"), flatten)) bool respond_wide(
-    const Recorded &of, int from)
-{
-    return respond_as<S, Block<S, Gent>, NB>(of, from);
-}
-bool respond_gent(const Recorded &of, int from)
-{
-    if (!__builtin_cpu_supports("avx2"))
-        return respond_as<Eight, Block<Eight, Gent>>(of, from);
-    // The most common case of identification has its own code.
-    if (of.branches == 0 && of.modes == 0 && !of.damping_varies() && of.wanted_count - from <= 4)
-        return respond_wide<Dual<four, 1>, 0>(of, from);
-    if (of.branches == 1 && of.modes == 0 && !of.damping_varies() && of.theta[first_branch + 2] == maxwell)
-        return respond_wide<Dual<four, 2>, 1>(of, from);
-    return respond_wide<Dual<four, 2>, most_branches>(of, from);
-}
-bool respond_part(const Recorded &of, int from)
-{
-    const int left = of.wanted_count - from;
-    if (int(of.material[kind_at]) > neo_hookean)
-        return of.by_constants() ? respond_as<Eight, AnyOf<Eight>>(of, from)
-            : left > 0 ? respond_as<Eight, Any>(of, from) : respond_as<double, Any>(of, from);
-    return left > 0 ? respond_gent(of, from) : respond_as<double, Block<double, Gent>>(of, from);
-}
-bool respond_all(const Recorded &of)
-{
-    int from = 0;
-    do
-        if (!respond_part(of, from))
-            return false;
-    while ((from += 8) < of.wanted_count);
-    return true;
-}
-// Returns whether the motion was followed to its end.
-bool respond(Numbers theta, Numbers material, int branches, Places wanted, Numbers start, Numbers begins,
-    Numbers levels, Numbers ramps, double field, double field_lag, Numbers times, double rtol,
-    Results stretch, Results rate, Results jacobian, Results by_rate, Numbers behind, Results behind_last)
-{
-    const int64_t cells = int64_t(times.count) * wanted.count;
-    const int64_t modal = theta.count - first_branch - branch_places * branches;
-    if (!fit(branches >= 0 && branches <= most_branches && modal >= 0 && modal <= mode_places * most_modes
-            && modal % mode_places == 0
-            && start.count == wanted.count && begins.count && levels.count == begins.count
-            && ramps.count == begins.count && stretch.count == times.count && rate.count == times.count
-            && jacobian.count == cells && (!by_rate.count || by_rate.count == cells)
-            && (!behind.count || behind.count == branches)
-            && (!behind_last.count || behind_last.count == branches)))
-        return false;
-    Recorded of{};
-    of.theta = theta.data, of.material = material.data, of.branches = branches;
-    of.modes = int(modal / mode_places);
-    of.wanted_count = wanted.count, of.wanted = wanted.data, of.start = start.data;
-    of.pieces = begins.count, of.begins = begins.data, of.levels = levels.data, of.ramps = ramps.data;
-    of.field = field, of.field_lag = field_lag, of.rtol = rtol;
-    of.count = times.count, of.times = times.data, of.stretch = stretch.data, of.rate = rate.data;
-    of.jacobian = jacobian.data, of.by_rate = by_rate.count ? by_rate.data : nullptr;
-    of.behind = behind.count ? behind.data : nullptr;
-    of.behind_last = behind_last.count ? behind_last.data : nullptr;
-    return apart([&] { return respond_all(of); });
-}
-// Returns the equilibrium stretch under a level, NaN if there is none, and writes its derivatives
-// by the wanted parameters.
-double rest(Numbers theta, Numbers material, double level, Places wanted, Results slopes)
-{
-    if (!fit(theta.count >= first_branch && wanted.count == slopes.count))
-        return 0;
-    Recorded of{};
-    of.theta = theta.data, of.material = material.data;
-    of.wanted_count = wanted.count, of.wanted = wanted.data;
-    const double pull = theta[drive_of] * level + theta[force_of];
-    const double l = quantity(equilibrium_q, pull / theta[stiffness_of], of.material);
-    for (int from = 0; from < of.wanted_count; from += 8)
-        if (int(material[kind_at]) > neo_hookean)
-            Response<Eight, AnyOf<Eight>>(of, from).hold(l, level, slopes.data);
-        else
-            Response<Eight, Block<Eight, Gent>>(of, from).hold(l, level, slopes.data);
-    return hmsa::finite(quantity(stiffness_q, l, of.material)) ? l : __builtin_nan("");
-}
+// -- linear systems -----------------------------------------------------------------------------------
 
 // Solves a symmetric system for each subset of its unknowns, a row of the arrays after the matrix,
 // in place; writes the logarithms of the determinants.
@@ -507,10 +269,6 @@ Nothing subsets(Numbers matrix, Array<const bool> varies, Results values, Result
     return {};
 }
 
-template <auto f> PyMethodDef method(const char *name)
-{
-    return {name, (PyCFunction)(void (*)())bound<f>, METH_FASTCALL, nullptr};
-}
 PyMethodDef methods[] = {
     method<quantity_of<force_q>>("elastic_force"),
     method<quantity_of<stiffness_q>>("elastic_stiffness"),
@@ -526,7 +284,6 @@ PyMethodDef methods[] = {
     method<two_step_batch>("two_step_batch"), method<follow>("follow"),
     method<sample_of>("sample"), method<flow_rates>("flow_rates"), method<trail_of>("trail"),
     method<solve>("solve"), method<smooth>("smooth"), method<staircase>("staircase"),
-    method<respond>("respond"), method<rest>("rest"),
     method<subsets>("subsets"), {nullptr, nullptr, 0, nullptr}};
 PyModuleDef module = {PyModuleDef_HEAD_INIT, "_motion", nullptr, 0, methods, nullptr, nullptr, nullptr, nullptr};
 }  // namespace
