@@ -214,6 +214,17 @@ def test_close_modes_that_change_with_the_stretch_are_no_single_one_of_more_damp
     assert [x.share[0] for x in found.modes] == pytest.approx([0.12, 0.12], rel=0.15)
 
 
+def test_a_mode_close_to_the_first_is_named_and_identified():
+    known = replace(BLOCK, damping_coefficient=0.12)
+    recording = recorded(replace(
+        known, mass_factor=1.2, modes=Modes((1.09, 1.45), (0.25, 0.1), (0.026, 0.04))))
+    assert identify(recording, actuator=known).reason.endswith('try --free +modes')
+    found = identify(recording, WITH_MODES, actuator=known)
+    assert found.verdict == 'identified', found.reason
+    assert found.modes[0].ratio[0] == pytest.approx(1.09, rel=0.01)
+    assert found.modes[0].share[0] == pytest.approx(0.25, rel=0.1)
+
+
 def test_without_modes_none_is_found():
     found = identify(recorded(replace(BLOCK, mass_factor=1.3)), WITH_MODES, actuator=BLOCK)
     assert found.verdict == 'identified', found.reason
@@ -274,6 +285,7 @@ def test_finite_elements_are_rejected_for_a_second_mode_and_identified_with_it()
     assert found.parameters['damping_coefficient'].value == pytest.approx(
         BLOCK.damping_coefficient, rel=0.1)
     assert found.parameters['remanence'].value == pytest.approx(BLOCK.remanence, rel=0.03)
+    assert abs(found.parameters['stretch_bias'].value) < 3.0 * found.parameters['stretch_bias'].std
     assert any('modes leave' in x for x in found.warnings)
 
 

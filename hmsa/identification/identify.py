@@ -185,8 +185,7 @@ def _with_modes(
     one, tried, agreed = search(recording, begin, first)
     start = one.values if 'shear_modulus' in together or together == first else rescaled(
         one.values, values['shear_modulus'], together)
-    setting = (one, start, together, actuator.chain_limit, actuator.modes.numbers)
-    best = narrower(with_modes(*setting), *setting)
+    best = narrower(one, start, together, actuator.chain_limit, actuator.modes.numbers)
     return _conclude(
         *_with_errors_of_stamps(best), [], tried, agreed, given, actuator.chain_limit, one)
 

@@ -26,6 +26,9 @@ from hmsa.model.equations import Array
 
 # Fraction of the allowed standard deviation above which it is checked by a profile.
 _NEARLY_LOST = 0.3
+# Quantiles of the stretch between which errors of a continuum's model count as one draw: with
+# more parts, intervals missed the first frequency of finite elements more often.
+_PARTS = 1.0 / 3.0, 2.0 / 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,12 +60,16 @@ def precision_of(best: Fit, variance: Array, given: Mapping[str, float | None]) 
     correlated = widening(columns, weighted, inverse, found)
     missing = departures(best, found, inverse, deviation, given)
     if diagnosis.modal(best) and not found.white:
-        # Errors of the model are what residuals contain, and stand for all departures.
-        correlated = np.maximum(correlated, clustered(
-            columns, weighted, inverse, changes_of(best.recording)))
+        # Errors of the model are what residuals contain, and stand for all departures. They are
+        # alike after equal changes of level, and at similar stretches.
+        shown = best.response.stretch
+        correlated, similar = (np.maximum(correlated, clustered(columns, weighted, inverse, x))
+                               for x in (changes_of(best.recording), np.digitize(
+                                   shown, np.quantile(shown, _PARTS))))
+        factors = np.maximum(correlated, similar)
         return Precision(
             deviation, freedom, found, inverse, correlated, correlated,
-            inverse * deviation ** 2 * np.outer(correlated, correlated), missing)
+            inverse * deviation ** 2 * np.outer(factors, factors), missing)
     variance = variance + _blurred(best, deviation, columns, inverse)
     proved, factors = (
         correlated * np.sqrt(np.maximum(x / np.diag(inverse) / deviation ** 2, 1.0))
