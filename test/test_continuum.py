@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 from hmsa import Actuator
 from hmsa.api.facts import unquestioned
 from hmsa.cli import main
-from hmsa.errors import BadInputError
+from hmsa.errors import BadInputError, UnusualWarning
 from hmsa.model import law
 from hmsa.model.actuators import Actuators, Setup
 from hmsa.model.continuum import mode_shapes, mounted, spectrum
@@ -290,6 +290,17 @@ def test_modal_keeps_the_limits_of_the_coil_or_is_refused():
     assert np.max(np.abs(block.plan([(1.05, 0.5), (0.96, 0.5)], 'modal').flux_densities)) <= 0.06
     with pytest.raises(BadInputError, match='expected'):
         block.plan([(1.3, 0.5)], 'modal')
+
+
+def test_flat_glued_block_says_how_far_it_rests_from_its_targets(tmp_path, capsys):
+    words = 'to 0.9, 1.1 and 1.2 rest about 2.3, 0.6 and 0.7 % of the step beyond'
+    with pytest.warns(UnusualWarning, match=words):
+        Actuator(half_thickness=5e-3, mount='glued')
+    with pytest.warns(UnusualWarning, match=words):
+        Actuator(half_thickness=5e-3).replace(mount='glued')
+    assert main(['init', '--yes', '--half-thickness', '5mm', '--mount', 'glued', '--out',
+                 str(tmp_path / 'actuator.yaml')]) == 0
+    assert words in capsys.readouterr().err
 
 
 def test_mounted_block_rests_by_modal_and_rings_by_two_step():

@@ -146,7 +146,7 @@ class Actuator:
         #: Parameters that plans are made with.
         self.model = model_of(parameters_in(given), zeta, damping_ratio, mount)
         self._belief: Belief | Path | None = None
-        warn(self)
+        warn(self, mount)
 
     @classmethod
     def from_parameters(
@@ -417,7 +417,7 @@ class Actuator:
              if x.partition('.')[0] not in groups} | changed,
             None if 'actuator.damping_coefficient' in changed else zeta,
             parameters.get('damping_ratio'), parameters.get('mount', 'paper')))
-        warn(made)
+        warn(made, parameters.get('mount', 'paper'))
         return made
 
     def scaled(self, **factors: float) -> 'Actuator':

@@ -36,6 +36,10 @@ _GRAVITY = 9.81
 _HARDLY = 0.01
 # Sides of a block: half thickness over half length.
 _SIMILAR = (0.05, 20.0)
+# By H/L, rest of a glued block beyond 0.9, 1.1 and 1.2 in % of the step, if its stiffness is that
+# of small stretch: Newton's method on benchmarks/block_elements.py, 5 to 9 elements high, J_lim 5.
+_GLUED = {0.1: (22.0, 6.0, 6.6), 0.25: (6.2, 1.1, 1.2), 0.35: (3.8, 0.7, 0.7),
+          0.5: (2.3, 0.6, 0.7)}
 _SILENT: ContextVar[bool] = ContextVar('silent', default=False)
 # Moves from rest of which the vibration is told, of a block and of a beam; time in natural
 # periods, and samples, in which it is looked for.
@@ -52,20 +56,21 @@ def unquestioned() -> Iterator[None]:
         _SILENT.reset(token)
 
 
-def warn(actuator: 'Actuator') -> None:
+def warn(actuator: 'Actuator', mount: str = 'paper') -> None:
     """Warn of each implausible value."""
     if not _SILENT.get():
-        for doubt in doubts(actuator):
+        for doubt in doubts(actuator, mount):
             assume(doubt, UnusualWarning)
 
 
-def doubts(actuator: 'Actuator') -> list[str]:
+def doubts(actuator: 'Actuator', mount: str = 'paper') -> list[str]:
     """Return a sentence about each implausible value of an actuator and its coil."""
     form = actuator.law if actuator.law in FORMS else 'block'
     values = _values(actuator, form)
     return [
         *(said for x in FORMS[form] if x.key in values and (said := x.doubt(values[x.key]))),
-        *_of_motion(actuator, form), *_of_sizes(form, values)]
+        *_of_motion(actuator, form), *_of_sizes(form, values), *(
+            _of_glue(actuator.block) if mount == 'glued' else ())]
 
 
 def _values(actuator: 'Actuator', form: str) -> Mapping[str, float]:
@@ -118,6 +123,18 @@ def _of_sizes(form: str, values: Mapping[str, float]) -> Iterator[str]:
             yield (
                 f'half thickness over half length is {ratio:.3g}: the model describes a block '
                 'with sides of similar length; a thin film or a long rod bends instead')
+
+
+def _of_glue(block: ActuatorParameters) -> Iterator[str]:
+    """Yield how far a flat block rests from where uniform deformation has it."""
+    shape, known = block.half_thickness / block.half_length, np.array([*_GLUED])
+    if shape <= known[-1]:
+        off = [float(np.interp(math.log(shape), np.log(known), x))
+               for x in zip(*_GLUED.values(), strict=True)]
+        yield (
+            f'a glued block of H/L {shape:.3g} does not deform uniformly: moves to 0.9, 1.1 and '
+            f'1.2 rest {"at least" if shape < known[0] else "about"} {off[0]:.2g}, {off[1]:.2g} '
+            f'and {off[2]:.2g} % of the step beyond; correct its levels by hmsa learn')
 
 
 def _facts_of_volume(block: ActuatorParameters) -> list[tuple[str, str]]:

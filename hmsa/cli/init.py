@@ -126,7 +126,7 @@ def run(arguments: argparse.Namespace) -> int:
     made = _actuator(form, given, arguments.law, arguments.mount)
     found = made.scales
     given.setdefault('shear_modulus', made.block.shear_modulus)
-    doubts = doubts_of(made)
+    doubts = doubts_of(made, arguments.mount)
     if missing:
         shown = [f'{x.words} {x.show(given[x.key])}' + (
             ', as the half length' if x.key == 'half_thickness' else '') for x in missing]
