@@ -10,8 +10,10 @@ from scipy.integrate import solve_ivp
 
 from benchmarks.block_elements import Block
 from hmsa.cli import main
+from hmsa.identification.diagnosis import cost, unexplained
 from hmsa.identification.excitation import Bounds, excite
 from hmsa.identification.files import file_text, read_belief
+from hmsa.identification.fit import fit
 from hmsa.identification.identify import identify
 from hmsa.identification.measurement import Measurement
 from hmsa.identification.quantities import (
@@ -29,6 +31,7 @@ from hmsa.model.equations import elastic_force
 from hmsa.model.modes import Modes
 from hmsa.model.parameters import paper_actuator
 from hmsa.model.simulation import ActuatorSimulation
+from hmsa.planning.two_step import plan_two_step
 
 BLOCK = replace(paper_actuator(), damping_coefficient=0.5)
 TRUE = replace(
@@ -223,6 +226,32 @@ def test_a_mode_close_to_the_first_is_named_and_identified():
     assert found.verdict == 'identified', found.reason
     assert found.modes[0].ratio[0] == pytest.approx(1.09, rel=0.01)
     assert found.modes[0].share[0] == pytest.approx(0.25, rel=0.1)
+
+
+def test_gain_beside_modes_that_leave_more_than_noise_may_be_an_error_of_the_statics():
+    known = replace(BLOCK, damping_coefficient=0.25)
+    found = identify(recorded(replace(known, mass_factor=1.2, modes=Modes(
+        (1.7,), (0.2,), (0.05,), (0.4,), (-2.0,))), extras={'stretch_gain': 0.8}, count=5),
+        (*WITH_MODES, 'stretch_gain'), actuator=known)
+    assert found.verdict == 'not_identifiable'
+    assert 'an error of the statics of the actuator would look the same' in found.reason
+
+
+def test_residuals_of_shaped_moves_stand_for_twice_as_much_vibration():
+    factors, steps = [], recorded()
+    for shaped in (False, True):
+        recording = steps
+        if shaped:
+            plan = plan_two_step(1.0, 1.1, BLOCK.nondimensional)
+            recording = replace(
+                steps, level_times=np.array([0.0, 0.02, 0.02 + plan.tau_p * BLOCK.time_unit]),
+                levels=BLOCK.flux_density_unit * np.array([0.0, plan.beta_p, float(
+                    elastic_force(1.1, BLOCK.nondimensional))]))
+            recording = replace(recording, stretch=respond(
+                recording, values_of(BLOCK), ()).stretch)
+        found = fit(recording, values_of(BLOCK), ('remanence', *SECONDARY[0]), most=3)
+        factors.append(cost(found, (), None) / unexplained(found))
+    assert factors[1] == pytest.approx(2.0 * factors[0])
 
 
 def test_without_modes_none_is_found():

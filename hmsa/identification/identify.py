@@ -9,7 +9,7 @@ import numpy as np
 
 from hmsa.errors import BadInputError, check_number
 from hmsa.identification import diagnosis, quantities
-from hmsa.identification.defects import dead_band, GAIN
+from hmsa.identification.defects import dead_band, GAIN, USUAL_GAIN
 from hmsa.identification.diagnosis import repeated
 from hmsa.identification.fit import (
     errors_of_stamps,
@@ -21,7 +21,7 @@ from hmsa.identification.fit import (
     whiteness,
     widening,
 )
-from hmsa.identification.initial_guess import begins_at_rest, segments
+from hmsa.identification.initial_guess import begins_at_rest
 from hmsa.identification.intervals import estimates_of, Precision, precision_of, stamp_error
 from hmsa.identification.measurement import Measurement
 from hmsa.identification.modal import (
@@ -62,8 +62,6 @@ _ALONG = (
     'need the same')
 # Largest bulk modulus to begin with, in units of G.
 _BULK_RATIO = 100.0
-# Maximum overshoot of the moves of a shaped run, as a fraction of the step.
-_SHAPED = 0.15
 
 
 def identify(
@@ -204,13 +202,16 @@ def _challenged(
         return found
     found = replace(found, warnings=(*found.warnings, _on_trust(found, added)))
     law = best.values['law']
-    if law is not None and law.section and GAIN in added:
-        # No constant of a beam's law is free: only its given shape separates gain and remanence.
+    if GAIN in added and (law is not None and law.section or (
+            diagnosis.modal(best) and not found.whiteness.white)):
+        # Only a force that is known exactly separates gain and remanence. That of a beam has no
+        # free constant, and a block that does not deform uniformly has another one.
         gain = found.parameters[GAIN]
-        if abs(gain.value - 1.0) > _SURE * gain.std:
+        if abs(gain.value - 1.0) > min(_SURE * gain.std, USUAL_GAIN):
             return replace(found, verdict='not_identifiable', reason=(
-                f'{GAIN} comes out as {gain.value:.4g}, and an error of the statics of the beam '
-                f'would look the same; calibrate the sensor, and give --known {GAIN}=VALUE+-STD'))
+                f'{GAIN} comes out as {gain.value:.4g}, and an error of the statics of the '
+                'actuator would look the same; calibrate the sensor, and give --known '
+                f'{GAIN}=VALUE+-STD'))
     if diagnosis.modal(best):
         return found
     lines, by_others = lines_of(best, diagnosis.frequency_of(best), 1, added)
@@ -445,22 +446,8 @@ def _warnings(
     found += diagnosis.considered(known.missing.considered, std, best.free, given)
     if known.missing.late is not None:
         found += diagnosis.undetected(known.missing.late, std, best)
-    if _shaped(best):
+    if max(diagnosis.overshoots(best), default=1.0) < diagnosis.SHAPED:
         found.append(
             'all moves are shaped so that nothing rings: they carry about a sixth of the '
             'information of unshaped steps; record what hmsa excite --out levels.csv proposes')
     return found
-
-
-def _shaped(best: Fit) -> bool:
-    """Return whether hardly any motion overshoots its final stretch."""
-    fitted, before = best.response.stretch, None
-    past = []
-    for begin, end, _, _ in segments(best.recording, 6):
-        rest = float(fitted[end - 1])
-        before = float(fitted[begin]) if before is None else before
-        if abs(rest - before) > 0.01:
-            part = (fitted[begin:end] - rest) / (rest - before)
-            past.append(float(np.max(part)))
-        before = rest
-    return bool(past) and max(past) < _SHAPED

@@ -61,12 +61,13 @@ def precision_of(best: Fit, variance: Array, given: Mapping[str, float | None]) 
     missing = departures(best, found, inverse, deviation, given)
     if diagnosis.modal(best) and not found.white:
         # Errors of the model are what residuals contain, and stand for all departures. They are
-        # alike after equal changes of level, and at similar stretches.
+        # alike after equal changes of level, and at similar stretches, of which intervals contain
+        # the values at each: the deviation of one, not that of their mean.
         shown = best.response.stretch
         correlated, similar = (np.maximum(correlated, clustered(columns, weighted, inverse, x))
                                for x in (changes_of(best.recording), np.digitize(
                                    shown, np.quantile(shown, _PARTS))))
-        factors = np.maximum(correlated, similar)
+        factors = np.maximum(correlated, math.sqrt(len(_PARTS) + 1.0) * similar)
         return Precision(
             deviation, freedom, found, inverse, correlated, correlated,
             inverse * deviation ** 2 * np.outer(factors, factors), missing)

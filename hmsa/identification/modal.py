@@ -477,9 +477,17 @@ def _gain(before: Fit, after: Fit) -> tuple[float, float]:
     return 2.0 * (one - two), 1.0 - two / max(one, 1e-300)
 
 
+def _close(found: Fit) -> bool:
+    """Return whether a mode is as close to the first as what changes with the stretch."""
+    return any(found.values[x[0]] < _NEAR for x in quantities.modes_of(found.values))
+
+
 def _better(before: Fit, after: Fit, least: float) -> bool:
     """Return whether a fit explains more than one with fewer parameters by chance does."""
     chi_squared, part = _gain(before, after)
+    if _close(after) and not _close(before):
+        # On finite elements, one that explained 6 % was none, and one of a glued block, 57 %.
+        least = max(least, ENOUGH)
     return chi_squared > _CHI_SQUARED and (
         part > least or whiteness(after.root * after.residual).white)
 
