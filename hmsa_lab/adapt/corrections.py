@@ -18,14 +18,12 @@ from hmsa_lab.adapt.adaptive_joint import AdaptiveJoint
 from hmsa_lab.adapt.estimator import StateEstimate
 from hmsa_lab.adapt.expected_error import (
     Ahead,
-    AT_REST,
     CandidateLevels,
     caution,
     CLEARLY,
     expect,
     expect_along,
     ExpectedError,
-    LITTLE,
     MUCH,
     SHARE,
     worthwhile,
@@ -304,9 +302,7 @@ def _gains(joint: AdaptiveJoint, arrival: int, draft: Draft | None) -> Draft | N
     for each, least in ((doubted, hidden), (estimate, 0.0)):
         before = expect(each, course, slew, segment.arrival or 0)
         after = expect(each, _drafted(draft, planner.plan), slew)
-        if not worthwhile(
-                before, after, max(gain, least, uneven, _NOISE * estimate.noise),
-                little=LITTLE * step, share=SHARE if arrival else AT_REST):
+        if not worthwhile(before, after, max(gain, least, uneven, _NOISE * estimate.noise)):
             return None
     joint.after = after.size
     return draft
@@ -346,8 +342,8 @@ def _nearer(
     path = plan.segments[plan.under_way(estimate.time)].path
     span = 0.0 if path is None else float(np.ptp(path.course(path.breaks)[0]))
     return worthwhile(
-        before, after, max(_GAIN * span, _NOISE * estimate.noise), little=0.0,
-        share=SHARE if joint.adapted(joint.based(plan.level(estimate.time).model)) else CLEARLY)
+        before, after, max(_GAIN * span, _NOISE * estimate.noise),
+        SHARE if joint.adapted(joint.based(plan.level(estimate.time).model)) else CLEARLY)
 
 
 def _drafted(draft: Draft, plan: Timeline) -> CandidateLevels:

@@ -31,19 +31,13 @@ from hmsa.planning.timeline import JointModel
 from hmsa_lab.adapt.estimator import StateEstimate
 from hmsa_lab.adapt.motion import follow, Levels, ModelMotion, rest
 
-#: Maximum error after a correction, relative to that of the present course, while more corrections
-#: are possible, and at rest.
-SHARE, AT_REST = 0.9, 0.5
-#: The same relative to a plan with the given parameters.
-CLEARLY = 0.25
+#: Maximum error after a change, relative to that before, and to that of a plan with the given
+#: parameters.
+SHARE, CLEARLY = 0.9, 0.25
 #: Required gain, as a fraction of the step, before samples have shown an arrival.
 MUCH = 0.05
-#: Change, as a fraction of the step, up to which a correction is small.
-LITTLE = 2.5e-3
 # Other parameters must reduce the predicted error by at least this fraction of the step.
-_LEAST = 3e-4
-# Fraction of the step up to which a change is small; 0 while the given parameters are in use.
-_SMALL = 0.015
+_LEAST = 1e-4
 # Shorter steps are replaced by this one.
 _STEP = 0.15
 # Time in ns of a level before the course, which the field has then reached.
@@ -175,19 +169,16 @@ def _outcome(estimate: StateEstimate, misses: Array, rows: Array) -> ExpectedErr
 
 
 def worthwhile(
-        before: ExpectedError, after: ExpectedError, least: float = 0.0, *, little: float,
-        share: float = SHARE) -> bool:
+        before: ExpectedError, after: ExpectedError, least: float, share: float = SHARE) -> bool:
     """
     Return whether another course has a sufficiently smaller error, and gains at least ``least``.
 
     Both are compared along the direction in which their errors differ, since common errors do not
-    matter. The error has to decrease to less than ``share`` of the former one; for a change of
-    less than ``little``, in units of stretch, `SHARE` suffices, since it can do little harm.
+    matter. The error has to decrease to less than ``share`` of the former one.
     """
     if not math.isfinite(before.size + after.size):
         return after.size < before.size
     apart = before.apart(after)
-    share = SHARE if apart < little else share
     way = (before.misses - after.misses) / apart if apart else np.zeros(len(before.misses))
     square = [float((x.misses @ way) ** 2 + way @ x.covariance @ way) for x in (before, after)]
     beside = [float(np.trace(x.covariance) - way @ x.covariance @ way) for x in (before, after)]
@@ -198,14 +189,13 @@ def worthwhile(
 
 def clearly_better(
         estimate: StateEstimate, model: JointModel, used: JointModel, start: float, target: float,
-        *,
-        given: bool, shown: bool) -> bool:
+        *, given: bool, shown: bool) -> bool:
     """
     Return whether moves planned with a model have a clearly smaller predicted error.
 
-    The joint went from the start to the target; the trial moves lead back and further on. The
-    parameters in use are kept unless ``model`` is clearly better. If they are the ``given`` ones,
-    it must be much better until samples have ``shown`` an arrival.
+    The joint went from the start to the target; the trial moves lead back and further on. If the
+    parameters in use are the ``given`` ones, ``model`` must be clearly better, and much better
+    until samples have ``shown`` an arrival.
     """
     step = math.copysign(max(abs(target - start), _STEP), target - start)
     tried = [[_left(estimate, each, target, to) for each in (used, model)]
@@ -215,8 +205,7 @@ def clearly_better(
         return False
     before, after = map(_together, zip(*pairs, strict=True))
     return worthwhile(
-        before, after, MUCH if given and not shown else _LEAST,
-        little=0.0 if given else _SMALL, share=CLEARLY if given else AT_REST)
+        before, after, MUCH if given and not shown else _LEAST, CLEARLY if given else SHARE)
 
 
 def _together(outcomes: Sequence[ExpectedError]) -> ExpectedError:
