@@ -54,7 +54,7 @@ DISTANT = 0.1  # residual relative to the motion above which nothing was fitted
 # them, whose shares change with the stretch. Plans of modal then leave less than `_LEFT` of it,
 # and at order 3 less than `LEFT_AT_3` (benchmarks continuum). Shaped moves ring less, so that
 # their residuals stand for more: on finite elements, plans then left up to 2.9 times as much.
-TOLERATED, _LEFT, LEFT_AT_3, _OF_SHAPED = 0.15, 1.5, 0.3, 2.0
+TOLERATED, _LEFT, LEFT_AT_3, _OF_SHAPED = 0.15, 1.7, 0.3, 2.0
 # Overshoot below which moves are shaped, as a fraction of the step; and with modes unknown to it.
 SHAPED, _ROUGHLY_SHAPED = 0.15, 0.35
 # Fraction of these residuals above which another departure explains them.
