@@ -353,7 +353,8 @@ def with_modes(
     most : int
         Maximum number of modes.
     viscous : bool
-        Whether their damping ratios are those of a viscous material.
+        Whether their damping ratios are those of a viscous material, as long as they leave more
+        than noise with dampings of their own.
 
     Returns
     -------
@@ -391,6 +392,11 @@ def with_modes(
         if not (_possible(found) and _better(best, found, _PART_VISCOUS if viscous else _PART)):
             break
         best, wide, values = found, found.free, found.values
+        freed = fit(recording, values, (*wide, *(x[2] for x in SECONDARY[:i + 1])),
+                    most=_FULL) if viscous else None
+        if freed is not None and whiteness(freed.root * freed.residual).white:
+            # Modes with dampings of their own explain all but noise; so may further ones.
+            best, wide, values, viscous = freed, freed.free, freed.values, False
     return _completed(best, free) if quantities.modes_of(best.values) else best
 
 
@@ -407,12 +413,13 @@ def narrower(
     """
     narrow = with_modes(one, start, free, limit, given, viscous=True)
     modes = quantities.modes_of(narrow.values)
+    if modes and whiteness(narrow.root * narrow.residual).white:
+        return narrow
     if modes and unexplained(narrow) < DISTANT:
         freed = fit(
             narrow.recording, narrow.values, (*narrow.free, *(x[2] for x in modes)),
             most=_FULL)
-        if freed is not None and _gain(narrow, freed)[1] < ENOUGH and not whiteness(
-                freed.root * freed.residual).white:
+        if freed is not None and _gain(narrow, freed)[1] < ENOUGH:
             return narrow
     best = with_modes(one, start, free, limit, given)
     found = whiteness(best.root * best.residual)
