@@ -144,8 +144,7 @@ def test_a_controller_with_hardware_moves_it_and_says_what_it_measured(start, ro
     applied = field(ros)
     # A busy machine writes levels late, whatever that leaves.
     controller = start.hmsa(
-        'controller', *BENCH, '-p', 'vibration_tolerance:=3.0', '-p', 'arrival_tolerance:=3.0',
-        PYTHONPATH=str(TUTORIALS))
+        'controller', *BENCH, '-p', 'vibration_tolerance:=3.0', PYTHONPATH=str(TUTORIALS))
     send = start.hmsa('send', '1.1:0.3', '1.0:0.3', '--wait', '--timeout', '60')
     assert send.wait() == 0, send.output
     assert 'measured' in send.output
