@@ -13,6 +13,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.random import default_rng  # at first use, when commands are late, it takes 30 ms
 from numpy.typing import NDArray
 
 from hmsa.errors import HmsaError
@@ -178,7 +179,7 @@ class Lateness:
             ways = [*exception, *usual[::-(-len(usual) // (min(most, _RARE) - 1))]]
             return np.repeat(np.array(ways)[:, None], count, axis=1)
         alike = np.array([usual[int(x * len(usual))] for x in _SHARES])[:most, None]
-        chance = np.random.default_rng(0).choice(np.array(usual), (count, most)).T
+        chance = default_rng(0).choice(np.array(usual), (count, most)).T
         chance[:len(alike)] = alike
         return chance
 
