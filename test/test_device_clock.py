@@ -289,6 +289,16 @@ def test_lateness_from_a_stall_of_the_planner_is_no_reason_to_raise_lead_time():
     assert 'raise lead_time' not in message
 
 
+def test_a_planner_that_was_starting_has_not_stood_still():
+    time = 0
+    receipts = Receipts(lambda: time)
+    for said in ([], ['the planner stood still for 0.500 s']):
+        # Before the first look, as where a driver in the same process starts.
+        time += 500 * MS
+        receipts.look()
+        assert [x.words for x in receipts.take_disturbances()] == said
+
+
 def test_lateness_from_a_clock_is_no_reason_to_raise_lead_time():
     rig = Bench()
     rig.runtime.request(trajectory(*SLOW))

@@ -227,7 +227,7 @@ class Receipts:
     def __init__(self, steady: Callable[[], int]) -> None:
         self._steady = steady
         self.joints: dict[str, _Receiver] = {}
-        self._looked = steady()
+        self._looked: int | None = None
         self._disturbances: deque[Disturbance] = deque(maxlen=_REMEMBERED)
         self.silent: set[str] = set()
 
@@ -362,7 +362,8 @@ class Receipts:
     def look(self) -> list[str]:
         """Return the joints whose device has fallen silent, or is received again."""
         steady = self._steady()
-        absent, self._looked = steady - self._looked, steady
+        # Before the first look, a node may still be starting.
+        absent, self._looked = 0 if self._looked is None else steady - self._looked, steady
         changed: list[str] = []
         if absent > _PAUSE:
             self._disturbed(
