@@ -161,6 +161,41 @@ run(lambda: Still('still'), [])
     assert looked_at < 0.01 * left_alone
 
 
+# Runs hmsa, and prints each module that a node looks for once its loop runs.
+LATE_IMPORTS = """
+import sys
+from hmsa.cli import main
+from hmsa_ros.nodes import managed
+
+class Told:
+    def find_spec(self, name, *_):
+        print('late import:', name)
+
+def spin(*arguments, served=managed.spin):
+    sys.meta_path.insert(0, Told())
+    served(*arguments)
+
+managed.spin = spin
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_nodes_import_nothing_while_they_move_an_actuator_and_judge(ros, start):
+    # An import takes up to 0.1 s, during which no command is sent.
+    controller = start.python(
+        '-c', LATE_IMPORTS, 'controller', '--ros-args', '-p', 'feedback:=cautious',
+        '-p', 'publish_rate:=1000.0', '-p', 'mismatch.shear_modulus:=0.95')
+    markers = ros.collect(
+        topics.MARKERS.type, topics.from_outside(topics.MARKERS.name, 'plant'),
+        topics.MARKERS.qos)
+    send = start.hmsa('send', '1.1:0.3', '1.2:0.3', '1.0:0.3', '--wait', '--timeout', '60')
+    send.wait()
+    assert 'accepted' in send.output
+    ros.spin_until(lambda: markers, 'markers of the plant')
+    assert controller.stop() == 0
+    assert 'late import' not in controller.stdout
+
+
 @pytest.mark.slow
 @pytest.mark.xdist_group('loops')
 def test_loop_leaves_no_residual_vibration_beside_a_process_that_takes_a_core(

@@ -117,9 +117,7 @@ def condensed(
 
 
 def side(stretch: float, law: Elastic | None, j_lim: float, bulk_ratio: float) -> float:
-    """Return the transverse stretch of a block at rest under a stretch."""
-    if math.isinf(bulk_ratio):
-        return 1.0 / math.sqrt(stretch)
+    """Return the transverse stretch of a block at rest under a stretch, with a finite ratio."""
     s = float(_block(law, j_lim, bulk_ratio).isochoric(np.array([stretch]))[0])
     return float(stretch / s**1.5)
 

@@ -459,6 +459,8 @@ class ActuatorParameters:
 
     def side(self, stretch: float) -> float:
         """Return the transverse stretch of a block at rest under a stretch."""
+        if math.isinf(self.bulk_ratio):
+            return 1.0 / math.sqrt(stretch)
         from hmsa.model.compressible import side  # as above
 
         return side(stretch, self.law, self.chain_limit, self.bulk_ratio)
