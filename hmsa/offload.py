@@ -56,6 +56,11 @@ def at_once(doing: Doing) -> int:
     return doing.count if isinstance(doing, Offload) else 1
 
 
+def is_ready(doing: Doing) -> bool:
+    """Return whether work begins at once: no process for it is still starting."""
+    return not isinstance(doing, Offload) or doing.ready
+
+
 class Offload:
     """
     Execute work in separate processes, each one piece after another.
@@ -87,6 +92,15 @@ class Offload:
         except (OSError, EOFError):
             self._lose()
         return work(*arguments)
+
+    @property
+    def ready(self) -> bool:
+        """Whether no process is still starting."""
+        try:
+            return not any(x.starting for x in self._workers)
+        except (OSError, EOFError):
+            self._lose()
+        return True
 
     def start(self) -> None:
         """Start the processes if they are not running."""
@@ -135,6 +149,15 @@ class _Process:
         # List that receives the pending result; the first result signals that the worker is ready.
         self._owed: list[Any] | None = []
         self._ready = False
+        self._begun = monotonic_ns()
+
+    @property
+    def starting(self) -> bool:
+        """Whether it cannot execute work yet; raise `OSError` or `EOFError` if it never can."""
+        self.owes()
+        if not self._ready and monotonic_ns() - self._begun > _START:
+            raise TimeoutError
+        return not self._ready
 
     @property
     def patience(self) -> int:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from hmsa.model.parameters import paper_actuator
-from hmsa.offload import at_once, finish, goes_on, here, Offload
+from hmsa.offload import at_once, finish, goes_on, here, is_ready, Offload
 
 MS = 1_000_000
 
@@ -59,6 +59,25 @@ def test_each_gets_the_answer_to_what_it_asked_in_whatever_order_they_look(offlo
     gate.write_text('')
     assert finish(offload(whose, 3)) == (3, there)
     assert not offload.told
+
+
+def test_it_is_ready_once_its_process_has_started_or_cannot(offload, wait_until, monkeypatch):
+    assert is_ready(here)
+    offload.start()
+    assert not is_ready(offload)
+    wait_until(lambda: is_ready(offload), 'the process')
+    assert not offload.told
+    offload.close()
+    # One that ends while it starts, and one that takes too long.
+    for end, start in ((True, 60_000_000_000), (False, -1)):
+        monkeypatch.setattr('hmsa.offload._START', start)
+        broken = Offload(offload.told.append, 'test_offload')
+        broken.start()
+        if end:
+            broken._workers[0]._process.kill()
+        wait_until(lambda broken=broken: is_ready(broken), 'the end of the wait')
+        assert 'has ended, does not answer, or cannot start' in offload.told.pop()
+        broken.close()
 
 
 def test_two_processes_work_at_once_and_as_many_as_there_are_cores(tmp_path, monkeypatch):

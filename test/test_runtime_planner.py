@@ -492,6 +492,19 @@ def test_patience_with_a_plant_that_does_not_come_has_an_end():
     assert rig.notes() == ['nobody subscribes']
 
 
+def test_first_request_waits_for_feedback_that_is_starting_but_a_stop_does_not(monkeypatch):
+    rig = Rig(settings=QUIET)
+    monkeypatch.setattr(type(rig.runtime.follower), 'ready', False)
+    assert rig.runtime.request(StretchRequest('a', 1.1)).code == 'waiting'
+    rig.tick()
+    assert rig.codes() == ['none']
+    monkeypatch.setattr(type(rig.runtime.follower), 'ready', True)
+    rig.tick()
+    assert rig.status.verdict.code == 'accepted'
+    monkeypatch.setattr(type(rig.runtime.follower), 'ready', False)
+    assert rig.runtime.request(Stop()).code == 'accepted'
+
+
 def test_impossible_sample_is_ignored_with_a_note():
     rig = Rig(settings=PATIENT)
     rig.runtime.request(StretchRequest('a', 1.1))

@@ -7,7 +7,7 @@ from typing import Any
 
 from hmsa.judge.records import SensorModel
 from hmsa.judge.setpoint_samples import SetpointSamples
-from hmsa.offload import ANSWER, at_once, Awaited, Doing, goes_on, here
+from hmsa.offload import ANSWER, at_once, Awaited, Doing, goes_on, here, is_ready
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Believed
 from hmsa.planning.timeline import JointModel
@@ -65,6 +65,11 @@ class Feedback(Follower):
     def on(self) -> bool:
         """Whether samples are used."""
         return self._settings.feedback != 'off'
+
+    @property
+    def ready(self) -> bool:
+        """Whether the processes that estimate have started."""
+        return is_ready(self.doing)
 
     def do(self, *work: Any) -> Awaited[Any]:
         """Execute work with `doing` if feedback is on, else in this process."""

@@ -38,6 +38,11 @@ class Follower:
         return False
 
     @property
+    def ready(self) -> bool:
+        """Whether samples are used from the first one on: whatever does it has started."""
+        return True
+
+    @property
     def wake(self) -> int | None:
         """Time in ns of the next `update`; None for never, 0 for now."""
         return None

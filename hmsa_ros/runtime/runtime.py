@@ -583,6 +583,9 @@ class Runtime:
         if isinstance(request, Stop) or request is None and not self.deviations.astray:
             # A stop does not wait.
             return True
+        if request is not None and not self.follower.ready:
+            # Feedback that is still starting would miss the first moves.
+            return False
         try:
             if self.devices.must_wait(self.settings):
                 return False
