@@ -232,6 +232,8 @@ def test_a_plan_made_anew_is_judged_where_the_first_one_is_not_kept_to():
     late = judge(time, moved, setpoint(moved=100 * MS, end=90 * MS))
     assert late.verdict == 'late'
     assert 'but 10 ms after its time' in late.message
+    # Too short after the new plan: what the first one left is no finding of this one.
+    assert judge(time, moved, setpoint(moved=100 * MS, end=102 * MS)).open
 
 
 def test_what_is_known_of_the_sensor_counts():

@@ -398,6 +398,23 @@ def test_a_setpoint_that_a_plan_comes_back_to_is_not_missed():
     assert not hold.over
 
 
+@pytest.mark.parametrize(('corrections', 'verdict'), [
+    ((200,), Code.ARRIVED), ((200, 290), Code.ARRIVED), ((290,), Code.UNDECIDED)])
+def test_a_correction_shortly_before_the_end_of_a_setpoint_takes_no_arrival_back(
+        corrections, verdict):
+    # 5 % off until the first correction, which leaves nothing.
+    hold = setpoint_samples.SetpointSamples(
+        RequestedSetpoint(1.2, 1.0, 0, 100 * MS, 300 * MS, 600.0, 1.0))
+    for after in range(320):
+        if after in corrections:
+            hold.move((after + 5) * MS, corrected=True)
+        now = after * MS
+        hold.add([now], [1.2 if after > corrections[0] else 1.21], now, now)
+        hold.judge(now, now, Tolerances(), SensorModel(), observable=True)
+    assert hold.over
+    assert hold.found.verdict is verdict
+
+
 @pytest.mark.parametrize('lost', [(0, 300), (15, 300), (5, 240)])
 @pytest.mark.parametrize(('swing', 'verdict'), [(0.0, Code.ARRIVED), (0.02, Code.VIBRATING)])
 def test_what_is_held_is_judged_by_later_samples_where_those_after_the_arrival_are_lost(

@@ -98,8 +98,6 @@ def judge(
         return found
     # It did not follow the first plan; it may have followed a replanned one.
     again = _judged(stamps, values, setpoint, tolerances, sensor, moved)
-    if again.open and not found.open:
-        return found
     after = moved - (setpoint.end or moved + 1)
     return again if not again.arrived or after < 0 else replace(
         again, verdict=Code.LATE,

@@ -50,6 +50,8 @@ class SetpointSamples:
         self.over = False
         self.unreported = False  # whether it is missed and this is not reported yet
         self.news = False  # whether judged samples await an audit
+        # An arrival before the newest correction from samples.
+        self._arrived: Finding | None = None
         # The setpoint judged last, and its finding.
         self._answer: tuple[RequestedSetpoint, Finding] | None = None
         self._doing = doing
@@ -97,6 +99,8 @@ class SetpointSamples:
         if not held and end is not None and arrival >= end:
             self.miss('after replanning, it is reached only after its time')
             return
+        self._arrived = self.found if corrected and self.found is not None and (
+            self.found.arrived) else None
         self.found, self.over, self.unreported = None, False, False
         self._begin_at(arrival)
 
@@ -241,6 +245,9 @@ class SetpointSamples:
                 before.failed or before.arrived and found.verdict is Code.UNOBSERVED):
             # A shown miss stays a miss, and an arrival stays one until samples leave it open.
             found = before
+        elif self.over and found.open and self._arrived is not None:
+            # It has arrived before a correction that left too little time to judge it anew.
+            found = self._arrived
         self.found = found
         same = before is not None and before.verdict is found.verdict
         return None if same and not self.over else found
