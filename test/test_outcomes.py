@@ -121,6 +121,15 @@ def test_a_cut_off_names_itself_as_the_reason():
     assert newest(bench.all)[1].message.endswith('missed: the coil was cut off')
 
 
+def test_a_cut_off_after_the_end_of_a_request_takes_no_arrival_back():
+    bench = Bench()
+    bench.send((1.1, 300), (1.2, 600), name='x')
+    bench.wait(900)
+    bench.loop.runtime.cut_off('a', in_force=True, time=bench.loop.now)
+    bench.wait(300)
+    assert bench.told == [('x', 1, 'arrived', ''), ('x', 2, 'arrived', '')]
+
+
 def test_a_correction_from_samples_is_told_with_its_arrival():
     bench = Bench(shear_modulus=1.05, feedback='adapt')
     bench.send((1.3, 500), (1.1, 1000), name='x')

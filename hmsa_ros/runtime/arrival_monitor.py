@@ -150,7 +150,10 @@ class _Joint:
         undone = self.undone()
         gone = self.leave_out(plan, now)
         for number in begun.keys() & gone:
-            begun[number].miss(why)
+            hold = begun[number]
+            # What is over before a plan is dropped, such as a long hold, was carried out.
+            if dropped is None or not hold.over or (hold.requested.end or now) > now:
+                hold.miss(why)
         self._miss((x for x in gone if x not in begun and x >= self.following), why)
         # After a plan that was dropped, what was reached before stays so.
         for hold in self.holds if plan.segments else ():
