@@ -231,6 +231,32 @@ def test_a_parameter_file_sets_what_a_node_has_above_what_all_have(tmp_path):
     assert found['plant.actuator.remanence'] == 0.2
 
 
+@pytest.mark.parametrize(('text', 'message'), [
+    ('/**: {ros__parameters: {actuator.half_lenght: 0.005, actuator.remanence: 0.1}}',
+     "'actuator.half_lenght' does not exist: .* such as actuator.half_length"),
+    ('/**: {ros__parameters: {half_length: 0.005, actuator.remanence: 0.1}}',
+     "'half_length' does not exist: .* such as actuator.half_length"),
+    ('actuator: {zeta: 0.1, remanence: 0.1}', "'actuator.zeta' does not exist"),
+    ('/**: {ros__parameters: {left.actuator.remanance: 0.1, actuator.remanence: 0.1}}',
+     "'left.actuator.remanance' does not exist"),
+    ('/**: {ros_parameters: {actuator.remanence: 0.1}}', "no ros__parameters .*'ros_parameters'"),
+    ('planner: {actuator.remanence: 0.1}', "in its section 'planner'")])
+def test_a_parameter_file_with_a_wrong_name_is_refused_rather_than_read_without(
+        tmp_path, text, message):
+    file = tmp_path / 'typo.yaml'
+    file.write_text(text)
+    with pytest.raises(BadInputError, match=message):
+        read_parameter_file(file)
+
+
+def test_names_of_joints_drivers_and_earlier_versions_are_no_wrong_ones(tmp_path):
+    file = tmp_path / 'it.yaml'
+    file.write_text(
+        '/**: {ros__parameters: {joints: [actuator], actuator.actuator.remanence: 0.1, law: gent, '
+        'actuator.slew_limit: 1.0, hardware.thermal.probe: 1, identification.noise_std: 0.1}}')
+    assert read_parameter_file(file)['plant.actuator.actuator.remanence'] == 0.1
+
+
 @pytest.mark.parametrize('text', ['9' * 400, '9' * 5000, '[' * 200_000, 'NaN', '"x"'])
 def test_recorded_parameters_that_are_no_numbers_are_no_numbers(text):
     found = recorded({'/plant.use_sim_time': 'false', '/plant.slew_limit': text}, '/')

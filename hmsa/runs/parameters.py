@@ -1,6 +1,7 @@
 """Parameters of a run, from a recording or from a parameter file of the nodes."""
 
 from collections.abc import Iterable, Iterator, Mapping
+from difflib import get_close_matches
 import json
 from pathlib import Path
 from typing import Any
@@ -122,6 +123,9 @@ def _own(
         [x for x in specs if found[x.name] is not None])
 
 
+# All parameters with such a first part.
+_KNOWN = {x.name for x in (*shared.BLOCK, *shared.VISCOELASTIC, *shared.MISMATCH)}
+_GROUPS = {x.partition('.')[0] for x in _KNOWN}
 _NAMES = tuple(
     name for x in shared.ACTUATOR for name in (x.name, f'mismatch.{x.name.partition(".")[2]}'))
 
@@ -160,7 +164,7 @@ def entries_of(path: Path) -> Entries:
     Return the parameters in a file for the nodes of this package.
 
     Sections for other nodes are not used, which is said. Raise `BadInputError` if the file cannot
-    be read.
+    be read, or has a parameter of the actuator that does not exist, which nodes refuse too.
     """
     try:
         document = load_yaml(
@@ -176,6 +180,12 @@ def entries_of(path: Path) -> Entries:
             f'{path} has no ros__parameters: expected a parameter file as hmsa init writes it')
     entries = []
     spaces: dict[str, list[str]] = {}
+    for key, inner in document.items():
+        if isinstance(inner, dict) and (str(key).startswith('/') or key in NODES) and not any(
+                sections_of({key: inner})):
+            raise BadInputError(
+                f'{path} has no ros__parameters in its section {excerpt(key)}, but '
+                f'{excerpt(", ".join(map(str, inner)))}: expected a file as hmsa init writes it')
     sections = list(sections_of(document)) or [('/**', document)]
     for section, values in sections:
         node = section.rpartition('/')[2]
@@ -194,7 +204,25 @@ def entries_of(path: Path) -> Entries:
             assume(
                 f'{path}: {" and ".join(exact)} are sections for nodes {node} in several '
                 'namespaces: values of later ones are taken where both have them')
+    _check_names(path, entries)
     return entries
+
+
+def _check_names(path: Path, entries: Entries) -> None:
+    """Raise `BadInputError` for a name of the actuator's parameters that none of them has."""
+    joints = [x for _, name, value in entries if name == 'joints' and isinstance(value, list)
+              for x in value]
+    for _, name, _ in entries:
+        first, _, rest = name.partition('.')
+        own = rest if first in joints or first not in _GROUPS and '.' in rest else name
+        group = f'{own.partition(".")[0]}.' if '.' in own else 'actuator.'
+        if own in _KNOWN or 'hardware' in name.split('.')[:2] or not (
+                own in shared.ACTUATOR_FIELDS or '.' in own and group[:-1] in _GROUPS):
+            continue
+        near = get_close_matches(own, sorted(x for x in _KNOWN if x.startswith(group)), 1, 0.0)
+        raise BadInputError(
+            f'{path}: parameter {excerpt(name)} does not exist: expected one of planner and '
+            f'plant, such as {near[0]}')
 
 
 def _flat(values: Mapping[Any, object], before: str = '') -> Iterator[tuple[str, object]]:
