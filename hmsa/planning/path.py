@@ -559,7 +559,8 @@ def _edges(request: MoveRequest, path: Path, tolerance: float) -> tuple[float, A
         raise RefusedError(
             Code.TOO_LONG,
             f'the path takes {np.sum(each):.3g} levels: expected at most {_MOST}; send it in '
-            'parts, or allow a larger deviation from it (path_tolerance)')
+            'parts, or allow a larger deviation from it (path_tolerance of the planner, tolerance '
+            'in Python)')
     edges = np.append(np.concatenate([
         begin + length * np.arange(count) / count for begin, length, count in zip(
             breaks[:-1].tolist(), spans[:, 0].tolist(), each.astype(int).tolist(),
