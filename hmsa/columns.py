@@ -17,6 +17,7 @@ from hmsa.files import read_at_most
 Array = NDArray[np.float64]
 
 _SEPARATORS = (';', '\t', ',', '|')
+_STRONGEST = 5.0  # flux density in T
 _LARGEST_FILE = 512 * 1024 * 1024
 # The first unit of each quantity is the default.
 _UNITS = {
@@ -37,6 +38,8 @@ _LENGTHS = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3, 'um': 1e-6, 'µm': 1e-6}
 _SUFFIXES = ('s', 'ms', 'us', 'ns', 't', 'mt', 'a', 'ma', 'm', 'cm', 'mm')
 # A row of units may have these below a number without a unit.
 _DIMENSIONLESS = ('', '1', '-')
+#: Words of a note.
+DIVIDED = 'divided by the length at rest'
 _DIVIDE = 'divide it by the length at rest, or name that: hmsa identify --rest-length 20mm'
 _MISSING = frozenset((
     '', 'nan', 'na', 'n/a', 'null', 'none', '-', '--', '\u2013', '\u2014',
@@ -77,6 +80,15 @@ class _Place:
     def rank(self) -> int:
         """Lower for a header that is closer to the wanted name."""
         return 2 if self.alias else 1 if self.unit else 0
+
+
+def check_flux_densities(source: object, levels: Array) -> None:
+    """Raise `BadInputError` for flux densities in T that no coil has, as of a column in mT."""
+    most = float(np.nanmax(np.abs(levels), initial=0.0))
+    if most > _STRONGEST:
+        raise BadInputError(
+            f'{source} has flux densities up to {most:.6g} T: expected at most {_STRONGEST:g} T; '
+            'if they are in mT, write "flux_density [mT]" in the header of the CSV')
 
 
 def _text(path: Path, kind: str) -> str:
@@ -310,6 +322,8 @@ def _of_another(cells: list[str]) -> str:
     names = ' '.join(cells).lower()
     if 'strain' in names:
         return '; stretch is strain' + ' in percent over 100' * ('%' in names) + ' plus 1'
+    if re.search('displacement|elongation|extension', names):
+        return '; stretch is the change of length over the length at rest, plus 1'
     return f'; for a length, {_DIVIDE}' if re.search('length|mm', names) else ''
 
 
@@ -321,7 +335,7 @@ def _taken(
     for name, place in places.items():
         what = f'{path}: column {excerpt(place.cell)} was '
         if place.name == 'stretch' and rest_length is not None:
-            found.append((f'{what}divided by the length at rest, {rest_length:g} m', True))
+            found.append((f'{what}{DIVIDED}, {rest_length:g} m', True))
         elif place.alias or factors[name] != 1.0:
             text = what + ' and '.join(
                 [f'taken for {name}'] * place.alias

@@ -46,6 +46,15 @@ def test_the_constant_is_right_to_a_fifth_of_a_percent_in_nearly_all_runs(satura
             assert x.saturation == pytest.approx(saturation, rel=0.02)
 
 
+def test_readings_in_mt_without_a_unit_are_refused(tmp_path, capsys):
+    source = tmp_path / 'readings.csv'
+    source.write_text('current,flux_density\n0,0\n1,50\n2,99\n3,148\n')
+    assert main(['calibrate', 'coil', str(source)]) == 2
+    assert 'readings.csv has flux densities up to 148 T: expected' in capsys.readouterr().err
+    with pytest.raises(BadInputError, match='write "flux_density'):
+        CoilModel(file=str(source))
+
+
 def test_a_coil_like_no_model_gets_a_table_that_the_driver_takes(tmp_path, capsys):
     source, out = tmp_path / 'readings.csv', tmp_path / 'coil.yaml'
     flux = 0.05 * LOOP + 0.02 * np.maximum(LOOP, 0.0)

@@ -203,6 +203,23 @@ def test_what_is_no_stretch_is_refused_with_what_it_looks_like(
     assert re.search(message, err)
 
 
+def test_a_length_at_rest_in_another_unit_is_refused_with_what_was_taken(folder, capsys):
+    write('camera.csv', 'time,length [mm]', zip(TIMES, 20.0 * STRETCH, strict=True))
+    status, _, err = identify(
+        capsys, 'camera.csv', '--commands', 'levels.csv', '--rest-length', '20')
+    assert status == 2
+    assert "'length [mm]' was divided by the length at rest, 20 m: check their units" in err
+    assert 'if it is' not in err
+
+
+def test_levels_in_mt_without_a_unit_are_refused_with_the_name_of_their_file(folder, capsys):
+    write('levels.csv', 'time,flux_density', zip(LEVELS[0], 1e3 * LEVELS[1], strict=True))
+    status, _, err = identify(capsys, 'camera.csv', '--commands', 'levels.csv')
+    assert status == 2
+    assert 'levels.csv has flux densities up to' in err
+    assert 'write "flux_density [mT]" in the header' in err
+
+
 @pytest.mark.parametrize(('samples', 'levels', 'wrong'), [
     (1e3, 1.0, 'camera.csv were in ms'), (1.0, 1e3, 'levels.csv were in ms'),
     (1e6, 1.0, 'camera.csv were in us')])

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hmsa.columns import CsvColumns, read_table
+from hmsa.columns import check_flux_densities, CsvColumns, DIVIDED, read_table
 from hmsa.errors import BadInputError, check_number
 from hmsa.interfaces.topics import PLANNER
 from hmsa.model.delivery import ramps
@@ -30,9 +30,8 @@ _CLIPPED_SLOPE = 0.01
 _CLIPPED_SAMPLES = 3
 # Number of repeated values in motion, if more than half of all, above which samples were held.
 _STAIRS = 4
-# Fraction of samples on either side that may be invalid, and the maximum flux density of a coil
-# in T.
-_FEW, _STRONGEST = 0.02, 5.0
+# Fraction of samples on either side that may be invalid.
+_FEW = 0.02
 # Maximum fraction of rows to leave out.
 _MOST_LEFT_OUT = 0.2
 # Interval, in median ones, above which a gap is noted.
@@ -141,11 +140,7 @@ class Measurement:
         if not len(self.levels):
             raise BadInputError(f'{self.label} has no level: expected the flux density in T')
         self._check_scale()
-        if np.max(np.abs(self.levels)) > _STRONGEST:
-            raise BadInputError(
-                f'{self.label} has flux densities up to {np.max(np.abs(self.levels)):.6g} T: '
-                f'expected at most {_STRONGEST:g} T; if they are in mT, write '
-                '"flux_density [mT]" in the header of the CSV')
+        check_flux_densities(self.label, self.levels)
         spread = float(np.quantile(self.stretch, 0.99) - np.quantile(self.stretch, 0.01))
         # The range of white noise is 4.65 standard deviations, as is that of its increments.
         jitter = float(np.median(np.abs(np.diff(self.stretch)))) / 0.954
@@ -192,10 +187,11 @@ class Measurement:
             else 'ten times the stretch, divide it by 10' if 6.0 < rest < 16.0
             else 'percent, divide it by 100' if 60.0 < rest < 160.0
             else 'a length, in mm or m perhaps, divide it by the length at rest')
+        divided = [x for x in self.notes if DIVIDED in x]
         raise BadInputError(
             f'{self.label} has {what.plural} from {low:.4g} to {high:.4g}'
-            + (f', {rest:.4g} without field' if seen else '')
-            + f': expected {what.meaning}; if it is ' + looks)
+            + (f', {rest:.4g} without field' if seen else '') + f': expected {what.meaning}; '
+            + (f'{divided[0]}: check their units' if divided else f'if it is {looks}'))
 
     def _unmoved(self, jitter: float) -> bool:
         """Return whether neither levels nor samples differ by more than noise."""
@@ -397,6 +393,7 @@ def read_csv(
     time, stretch = table.columns['time'][keep], table.columns['stretch'][keep]
     if commands is not None:
         times, levels = read_levels(commands, notes)
+        check_flux_densities(commands, levels)
         if time[0] - times[-1] > _ANOTHER_CLOCK:
             raise BadInputError(
                 f'{commands} ends at {times[-1]:.9g} s, and the first sample of {path} is at '
