@@ -56,6 +56,12 @@ def at_once(doing: Doing) -> int:
     return doing.count if isinstance(doing, Offload) else 1
 
 
+def start(doing: Doing) -> None:
+    """Start the processes that execute work, if there are to be any."""
+    if isinstance(doing, Offload):
+        doing.start()
+
+
 def is_ready(doing: Doing) -> bool:
     """Return whether work begins at once: no process for it is still starting."""
     return not isinstance(doing, Offload) or doing.ready

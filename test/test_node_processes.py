@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
-from std_srvs.srv import SetBool
+from std_srvs.srv import SetBool, Trigger
 
 from hmsa.cli import main
 from hmsa.interfaces import topics
@@ -161,15 +162,17 @@ run(lambda: Still('still'), [])
     assert looked_at < 0.01 * left_alone
 
 
-# Runs hmsa, and prints each module that a node looks for once its loop runs.
+# Runs hmsa, and prints each module that a node looks for in its loop.
 LATE_IMPORTS = """
 import sys
+import threading
 from hmsa.cli import main
 from hmsa_ros.nodes import managed
 
 class Told:
     def find_spec(self, name, *_):
-        print('late import:', name)
+        if threading.current_thread() is threading.main_thread():
+            print('late import:', name)
 
 def spin(*arguments, served=managed.spin):
     sys.meta_path.insert(0, Told())
@@ -194,6 +197,16 @@ def test_nodes_import_nothing_while_they_move_an_actuator_and_judge(ros, start):
     ros.spin_until(lambda: markers, 'markers of the plant')
     assert controller.stop() == 0
     assert 'late import' not in controller.stdout
+
+
+def test_a_planner_imports_what_new_settings_need_beside_its_loop(ros, start):
+    planner = start.python('-c', LATE_IMPORTS, 'planner')
+    for name, value in (('trajectory_mode', 'path'), ('feedback', 'observe')):
+        result, = ros.set_parameters('planner', [Parameter(name, value=value)])
+        assert result.successful
+    ros.spin_until(lambda: ros.call(Trigger, 'planner/reset_estimate').success, 'feedback')
+    assert planner.stop() == 0
+    assert 'late import' not in planner.stdout
 
 
 @pytest.mark.slow

@@ -4,7 +4,7 @@ from dataclasses import replace
 import math
 from threading import Semaphore, Thread
 
-from at_work import AtWork, MS, sample, START
+from at_work import AtWork, MS, planner, sample, START
 import pytest
 
 from hmsa.errors import HmsaError
@@ -12,6 +12,7 @@ from hmsa.model.equations import natural_frequency
 from hmsa.model.parameters import paper_actuator
 from hmsa.model.simulation import ActuatorSimulation
 from hmsa.model.status import Code, RefusedError
+from hmsa.planning import proceed
 from hmsa.planning.planner import Options, Planner
 from hmsa_ros.runtime.records import (
     PlanChanged,
@@ -503,6 +504,39 @@ def test_first_request_waits_for_feedback_that_is_starting_but_a_stop_does_not(m
     assert rig.status.verdict.code == 'accepted'
     monkeypatch.setattr(type(rig.runtime.follower), 'ready', False)
     assert rig.runtime.request(Stop()).code == 'accepted'
+
+
+def test_what_a_change_of_settings_needs_is_imported_beside_the_loop(monkeypatch):
+    class Later:
+        def __init__(self):
+            self.jobs = []
+
+        def submit(self, work):
+            self.jobs.append(Job(work))
+            return self.jobs[-1]
+
+    worker, imported = Later(), []
+    monkeypatch.setattr('hmsa.planning.path.prepare', lambda: imported.append('path'))
+    work = AtWork({'a': planner()}, QUIET, worker=worker)
+    settings = replace(QUIET, trajectory_mode='path')
+    for _ in range(2):
+        work.runtime.change(settings, {}, simultaneous=False)
+    job, = worker.jobs
+    assert not imported
+    job.run(proceed)
+    assert imported == ['path']
+
+    for _ in range(2):
+        work.runtime.change(replace(settings, feedback='adapt'), {}, simultaneous=False)
+    _, job = worker.jobs
+    assert not work.runtime.follower.on
+    # A move waits, and a stop does not.
+    assert work.runtime.request(StretchRequest('a', 1.1)).code == 'waiting'
+    assert work.runtime.wake == 0
+    job.run(proceed)
+    work.tick()
+    assert work.runtime.follower.on
+    assert work.status.verdict.code == 'accepted'
 
 
 def test_impossible_sample_is_ignored_with_a_note():

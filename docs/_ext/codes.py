@@ -113,7 +113,8 @@ EXPLANATIONS: Mapping[Code, tuple[str, str]] = {
         'by itself.'),
     Code.NONE: ('No request has arrived yet.', ''),
     Code.WAITING: (
-        'The request is accepted and starts as soon as the current state is known.', ''),
+        'The request is accepted and starts as soon as the current state is known, and feedback '
+        'has started.', ''),
     Code.ACCEPTED: ('The request is planned and is being executed.', ''),
     Code.UNCHANGED: ('The actuator is already moving there: the plan is unchanged.', ''),
     Code.SUPERSEDED: ('Another request arrived before this one was planned.', ''),

@@ -489,7 +489,7 @@ class _PathFit:
 
 
 def prepare() -> None:
-    """Import the modules that the first path needs, which takes a few tenths of a second."""
+    """Import the modules that the first path needs, which takes up to some seconds."""
     for name in ('interpolate', 'sparse.linalg'):
         import_module(f'scipy.{name}')
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from hmsa.judge.records import SensorModel
 from hmsa.judge.setpoint_samples import SetpointSamples
-from hmsa.offload import ANSWER, at_once, Awaited, Doing, goes_on, here, is_ready
+from hmsa.offload import ANSWER, at_once, Awaited, Doing, goes_on, here, is_ready, start
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Believed
 from hmsa.planning.timeline import JointModel
@@ -51,6 +51,7 @@ class Feedback(Follower):
             report_ended: Callable[[str], None], doing: Doing = here) -> None:
         """Begin; ``report_ended`` is called with the reason why feedback of a joint has ended."""
         super().__init__(group, settings, doing)
+        start(doing)
         self._outputs, self._clock, self._report_ended = outputs, clock, report_ended
         self.joints: dict[str, AdaptiveJoint] = {}
         self._corrections = Corrections(self, clock)

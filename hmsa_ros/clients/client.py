@@ -235,7 +235,8 @@ class PlannerClient(Link):
             self.spin_until(
                 lambda request=request: self.verdict.on(request) is not None,  # type: ignore[misc]
                 'the planner did not reply with a verdict', self.send_again,
-                awaited="the planner's verdict: it plans, or waits for plant, driver or samples")
+                awaited="the planner's verdict: it plans, or waits for plant, driver, samples or "
+                "feedback")
             verdict = self.verdict.on(request)
             if verdict is not None and verdict.level < DiagnosticStatus.ERROR[0]:
                 return verdict

@@ -1,6 +1,7 @@
 """What follows the joints by their samples: feedback, or nothing in open loop."""
 
 from collections.abc import Callable, Iterator, Mapping
+from importlib import import_module
 from typing import Any
 
 from hmsa.errors import BadInputError
@@ -115,5 +116,11 @@ def feedback(
         group: PlannerGroup, settings: Settings, outputs: list[Output], clock: Clock,
         report_ended: Callable[[str], None], doing: Doing) -> Follower:
     """Return feedback from samples; ``report_ended`` is told why that of a joint has ended."""
+    return import_feedback()(group, settings, outputs, clock, report_ended, doing)
+
+
+def import_feedback() -> Callable[..., Follower]:
+    """Return what makes feedback; importing it takes some tenths of a second."""
+    import_module('multiprocessing.connection')  # for the processes that estimate
     make: Callable[..., Follower] = registered(FOLLOWER)['adapt'].load()
-    return make(group, settings, outputs, clock, report_ended, doing)
+    return make

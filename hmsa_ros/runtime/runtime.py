@@ -20,7 +20,7 @@ from hmsa.planning.timeline import JointModel
 from hmsa_ros.runtime.arrival_monitor import ArrivalMonitor
 from hmsa_ros.runtime.command_link import CommandLink
 from hmsa_ros.runtime.deviations import Deviations
-from hmsa_ros.runtime.follower import feedback, Follower
+from hmsa_ros.runtime.follower import feedback, Follower, import_feedback
 from hmsa_ros.runtime.receipts import Receipts
 from hmsa_ros.runtime.records import (
     by_joint,
@@ -43,6 +43,7 @@ from hmsa_ros.runtime.request_queue import RequestQueue, SLICE
 from hmsa_ros.runtime.stops import Stops
 from hmsa_ros.runtime.takeover import SampleTimeout, Takeover
 from hmsa_ros.runtime.temperatures import Temperatures
+from hmsa_ros.runtime.worker import Job
 from hmsa_ros.timekeeping import clock_set_words, Throttle
 
 # In ns by the steady clock: delay of a service that is a stall of this process; time that the
@@ -56,7 +57,8 @@ _STORM = NANOSECONDS
 # A name that no other request has: 128 random bits.
 _UNIQUE = re.compile('[0-9a-f]{32}')
 _WAITING = Verdict(
-    Severity.OK, Code.WAITING, 'accepted: starts as soon as the current state is known')
+    Severity.OK, Code.WAITING,
+    'accepted: starts as soon as the current state is known, and feedback has started')
 
 
 class Runtime:
@@ -66,7 +68,8 @@ class Runtime:
             self, group: PlannerGroup, settings: Settings, environment: Environment) -> None:
         self.group = group
         self.settings = settings
-        self._prepare()
+        if settings.trajectory_mode == 'path':
+            path.prepare()
         self.active = False
         #: Refuses requests except stops, while several planners or devices are running.
         self.crowded: RefusedError | None = None
@@ -101,6 +104,7 @@ class Runtime:
         self.planning = RequestQueue(
             group, self.deviations, self.follower, self.temperatures, self._reporting, around,
             self.devices.send, self._stops.begin)
+        self._importing: Job | None = None  # import of feedback
         self._follow()
         self._next_beat = 0  # time in ns of the next heartbeat
         # Time by the steady clock, in ns, by which the caller serves this again; None for any.
@@ -115,7 +119,12 @@ class Runtime:
         self._impossible_due = Throttle()
 
     def _follow(self) -> None:
-        """Begin feedback from samples, once it is wanted."""
+        """Begin feedback from samples, once it is wanted and imported."""
+        if self._importing is not None:
+            if not self._importing.done():
+                return
+            self._importing.result()
+            self._importing = None
         if self.settings.feedback != 'off' and self.follower.open_loop:
             self.follower = feedback(
                 self.group, self.settings, self._outputs, self._clock, self._report_ended,
@@ -394,17 +403,17 @@ class Runtime:
         """Adopt new settings now, and new models by joint from the next request on."""
         if settings.heartbeat_period != self.settings.heartbeat_period:
             self._next_beat = self._clock() + settings.heartbeat_period
-        self.settings = settings
-        self._prepare()
+        before, self.settings = self.settings, settings
+        # Beside the loop: here, these imports would delay commands by up to some seconds.
+        if settings.trajectory_mode == 'path' != before.trajectory_mode:
+            self.environment.worker.submit(lambda _: path.prepare())
+        if settings.feedback != 'off' and self.follower.open_loop and self._importing is None:
+            self._importing = self.environment.worker.submit(lambda _: import_feedback())
         self._follow()
         for name, model in self.follower.change(settings, models).items():
             self.group.planners[name].take_model(model)
         self.temperatures.change()
         self.group.simultaneous = simultaneous
-
-    def _prepare(self) -> None:
-        if self.settings.trajectory_mode == 'path':
-            path.prepare()
 
     # -- out -----------------------------------------------------------------------------------
 
@@ -434,9 +443,9 @@ class Runtime:
         """Time in ns of the next work; None for never, 0 for now."""
         if self.urgent:
             return 0
-        if not self._takeover.engaged:
-            return self._reporting.pending
         now = self._clock()
+        if not self._takeover.engaged:
+            return self._reporting.pending if self._importing is None else now + LOOK
         times = [
             None if self.devices.all_silent else self.group.next_command(),
             self._reporting.pending, self._reporting.next_change, self._reporting.preview_again,
@@ -448,7 +457,7 @@ class Runtime:
             times.append(self._next_beat)
         if self.deviations.advises:
             times.append(now + LOOK)
-        if self.devices.receipts or self._stops.open:
+        if self.devices.receipts or self._stops.open or self._importing is not None:
             times.append(now + LOOK)
         return min((x for x in times if x is not None), default=None)
 
@@ -495,6 +504,7 @@ class Runtime:
         self._reporting.flush()
         if self._listens():
             return self._taken()
+        self._follow()
         if self._takeover.engaged:
             self._leave(now)
         self._engage()
@@ -583,7 +593,7 @@ class Runtime:
         if isinstance(request, Stop) or request is None and not self.deviations.astray:
             # A stop does not wait.
             return True
-        if request is not None and not self.follower.ready:
+        if request is not None and not (self._importing is None and self.follower.ready):
             # Feedback that is still starting would miss the first moves.
             return False
         try:
