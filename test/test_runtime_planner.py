@@ -506,6 +506,14 @@ def test_first_request_waits_for_feedback_that_is_starting_but_a_stop_does_not(m
     assert rig.runtime.request(Stop()).code == 'accepted'
 
 
+@pytest.mark.parametrize(('feedback', 'code'), [('observe', 'accepted'), ('adapt', 'waiting')])
+def test_a_request_waits_for_processes_that_start_only_where_plans_use_estimates(
+        monkeypatch, feedback, code):
+    monkeypatch.setattr('hmsa_lab.adapt.feedback.is_ready', lambda _: False)
+    rig = Rig(settings=replace(QUIET, feedback=feedback))
+    assert rig.runtime.request(StretchRequest('a', 1.1)).code == code
+
+
 def test_what_a_change_of_settings_needs_is_imported_beside_the_loop(monkeypatch):
     class Later:
         def __init__(self):

@@ -69,8 +69,8 @@ class Feedback(Follower):
 
     @property
     def ready(self) -> bool:
-        """Whether the processes that estimate have started."""
-        return is_ready(self.doing)
+        """Whether the processes that estimate have started, if plans use estimates."""
+        return self._settings.feedback not in ('adapt', 'cautious') or is_ready(self.doing)
 
     def do(self, *work: Any) -> Awaited[Any]:
         """Execute work with `doing` if feedback is on, else in this process."""
