@@ -17,8 +17,8 @@ VERDICTS = (
 PERIODS = 6
 # Prefix of the sensor properties in an estimate.
 _SENSOR = 'sensor.'
-# Smaller steps have no percentage.
-_NO_STEP = 1e-9
+# Smaller steps in stretch have no percentage: an estimated rest differs by them from a target.
+_NO_STEP = 1e-6
 
 
 @dataclass(frozen=True)
