@@ -220,6 +220,20 @@ def test_what_is_identified_plans_and_is_written_with_its_covariance(tmp_path):
         [(1.1, 1.0)], 'minimax').segments[0].move.duration * 1.5
 
 
+def test_a_fit_without_meaning_is_rejected_as_the_command_does():
+    motion = hmsa.Actuator(shear_modulus=30e3, half_length=5e-3, remanence=0.08).simulate(
+        [(0.0, 0.0), (0.02, 0.1), (0.06, -0.1), (0.1, 0.05), (0.15, 0.0)], until=0.2, noise=1e-4)
+    samples = np.column_stack([motion.times, motion.stretches])
+    # Millimetres that were taken for metres lead to a remanence that no parameter file may have.
+    found = hmsa.identify(samples, motion.levels, known={'half_length': 5.0})
+    assert found.verdict == 'model_rejected'
+
+
+def test_a_parameter_that_is_free_and_known_is_refused(block):
+    with pytest.raises(hmsa.HmsaError, match='remanence is free and known'):
+        hmsa.identify(block.simulate(LEVELS), free=['remanence'], known={'remanence': 0.1})
+
+
 def test_what_cannot_be_identified_says_why(block, tmp_path):
     motion = block.plan([(1.1, 0.2)]).simulate(noise=3e-3, rate=300)
     found = hmsa.identify(motion)

@@ -233,16 +233,22 @@ def identify(
     others = {x: y for x, y in {**given, **known}.items() if y or x in known}
     names = [] if free is None else names_of(free, 'free')
     result = find(
-        recording, free=free_of(','.join(names), base.block.law, others), known=others,
+        recording, free=free_of(','.join(names), base.block.law, known), known=others,
         actuator=None if actuator is None and not isinstance(samples, Motion) else block,
         uncertain=uncertain)
     text = file_text(
         result, Belief(result.actuator, others, base.parameters, Known()),
         recording.label, datetime.now().astimezone())
     # Only the file has all values under their names in the nodes.
-    belief = belief_in(text)
-    return Identified(result, Actuator.from_parameters(
-        belief.settings, belief if result.verdict == 'identified' else None), text)
+    try:
+        belief = belief_in(text)
+        found = Actuator.from_parameters(
+            belief.settings, belief if result.verdict == 'identified' else None)
+    except BadInputError:  # a fit without meaning has values that no actuator has
+        if result.verdict == 'identified':
+            raise
+        found = base
+    return Identified(result, found, text)
 
 
 def _at(actuator: Actuator, temperature: float) -> Actuator:

@@ -68,15 +68,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """
-    Read, identify and print.
-
-    Raises
-    ------
-    BadInputError
-        If a parameter is both free and known.
-
-    """
+    """Read, identify and print."""
     check_targets(
         arguments.out, arguments.report, sources=(arguments.recording, arguments.commands))
 
@@ -87,9 +79,6 @@ def run(arguments: argparse.Namespace) -> int:
 
     belief = read_belief(arguments.params_file)
     known, uncertain = known_of(arguments.known)
-    named = [x.strip(' +') for x in arguments.free.split(',')]
-    if both := [x for x in known if x in named]:
-        raise BadInputError(f'{both[0]} is free and known: expected it in --free or in --known')
     with progress('reading') as update:
         recording, belief, given = _read(arguments, belief)
         if arguments.temperature is not None:

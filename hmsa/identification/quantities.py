@@ -195,9 +195,12 @@ def free_of(
     Return the names of free parameters from a command line.
 
     Names replace the default list, without known ones; ``+NAME`` adds to it and ``-NAME`` removes
-    from it. Raise `BadInputError` if the latter is not free, and as `check_free` does.
+    from it. Raise `BadInputError` if the latter is not free, if a name is known too, and as
+    `check_free` does.
     """
     names = [x.strip() for x in text.split(',') if x.strip()]
+    if both := [x for x in known if x in names or f'+{x}' in names]:
+        raise BadInputError(f'{both[0]} is free and known: expected only one of them')
     free = [x for x in names if x[0] not in '+-']
     if not free:
         free = [x for x in DEFAULT_FREE if x not in known and (
