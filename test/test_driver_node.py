@@ -142,19 +142,26 @@ def test_hardware_that_cannot_be_had_refuses_the_start(
 @pytest.mark.ros
 def test_a_controller_with_hardware_moves_it_and_says_what_it_measured(start, ros):
     applied = field(ros)
-    controller = start.hmsa('controller', *BENCH, PYTHONPATH=str(TUTORIALS))
-    send = start.hmsa('send', '1.1:0.3', '1.0:0.3', '--wait', '--timeout', '60')
-    # A busy machine writes levels late: what that leaves is measured, too.
-    status = send.wait()
-    assert ('done: at_rest, measured' if status == 0 else ' of 2: rests ') in send.output
+    # A busy machine writes levels late, whatever that leaves.
+    controller = start.hmsa(
+        'controller', *BENCH, '-p', 'vibration_tolerance:=3.0', PYTHONPATH=str(TUTORIALS))
+    # It also leaves levels out: then the sequence is sent again.
+    for _ in range(4):
+        send = start.hmsa('send', '1.1:0.3', '1.0:0.3', '--wait', '--timeout', '60')
+        status = send.wait()
+        ros.spin_until(
+            lambda: any(x.magnetic_field.z for x in applied)
+            and not applied[-1].magnetic_field.z, 'the last level')
+        if status == 0 and len(applied) >= 5:
+            break
+    assert status == 0, send.output
+    assert 'measured' in send.output
 
     def names():
         return {x for x, _ in ros.node.get_node_names_and_namespaces()}
 
     ros.spin_until(lambda: {'planner', 'driver'} <= names(), 'both nodes of the controller')
     assert 'plant' not in names()
-    # Two levels for each move, of which a late one may be left out.
-    ros.spin_until(
-        lambda: any(x.magnetic_field.z for x in applied) and not applied[-1].magnetic_field.z,
-        'the levels of two moves')
+    # The level at the start, and two for each move.
+    ros.spin_until(lambda: len(applied) >= 5, 'the levels of two moves')
     assert controller.stop() == 0, controller.output
