@@ -16,6 +16,8 @@ import warnings
 _EXCERPT = reprlib.Repr()
 _EXCERPT.maxstring = _EXCERPT.maxother = 80
 _EXCERPT.maxlist = 4
+# A compared name may come from anyone, and a long one would take seconds.
+_LONGEST_NAME = 200
 _PACKAGES = ('hmsa.', 'hmsa_ros.', 'hmsa_lab.', 'hmsa_studies.')
 
 
@@ -63,6 +65,11 @@ class MissingWarning(UserWarning):
 
     ``warnings.simplefilter('ignore', hmsa.MissingWarning)`` accepts all of them.
     """
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Return the known name closest to another one, however far it is."""
+    return get_close_matches(name[:_LONGEST_NAME], list(known), 1, 0.0)[0]
 
 
 def meant(word: object, known: Iterable[str]) -> str:

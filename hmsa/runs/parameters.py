@@ -1,13 +1,12 @@
 """Parameters of a run, from a recording or from a parameter file of the nodes."""
 
 from collections.abc import Iterable, Iterator, Mapping
-from difflib import get_close_matches
 import json
 from pathlib import Path
 from typing import Any
 
 from hmsa.bag.limits import load_yaml
-from hmsa.errors import assume, BadInputError, BagError, excerpt
+from hmsa.errors import assume, BadInputError, BagError, excerpt, nearest
 from hmsa.files import read_at_most
 from hmsa.interfaces import parameters as shared
 from hmsa.interfaces.actuator import actuator_from, creep_from
@@ -219,10 +218,9 @@ def _check_names(path: Path, entries: Entries) -> None:
         if own in _KNOWN or 'hardware' in name.split('.')[:2] or not (
                 own in shared.ACTUATOR_FIELDS or '.' in own and group[:-1] in _GROUPS):
             continue
-        near = get_close_matches(own, sorted(x for x in _KNOWN if x.startswith(group)), 1, 0.0)
         raise BadInputError(
             f'{path}: parameter {excerpt(name)} does not exist: expected one of planner and '
-            f'plant, such as {near[0]}')
+            f'plant, such as {nearest(own, sorted(x for x in _KNOWN if x.startswith(group)))}')
 
 
 def _flat(values: Mapping[Any, object], before: str = '') -> Iterator[tuple[str, object]]:

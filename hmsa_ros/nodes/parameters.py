@@ -9,7 +9,6 @@ override has no value until it is set.
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-import difflib
 import math
 from pathlib import Path
 import re
@@ -22,7 +21,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from hmsa.bag.limits import load_yaml
-from hmsa.errors import BadInputError, HmsaError, listed
+from hmsa.errors import BadInputError, HmsaError, listed, nearest
 from hmsa.files import read_at_most
 from hmsa.interfaces import topics
 from hmsa.interfaces.actuator import completed
@@ -39,7 +38,7 @@ from hmsa.plugins import NODES, registered
 
 # A parameter file that is larger is not looked at again.
 _LARGEST_FILE = 1 << 20
-# Characters of an unknown name that are compared and reported.
+# Characters of an unknown name that are reported.
 _LONGEST_NAME = 200
 # Names written by earlier versions of hmsa identify.
 _ONCE = {'identification.verdict', 'identification.noise_std'}
@@ -239,12 +238,10 @@ def unread_files(arguments: Sequence[str], nodes: Sequence[str]) -> Iterator[str
 
 def unknown(node: Node, name: str, others: Iterable[str] = ()) -> BadInputError:
     """Return the error of an unknown name, with the closest one of the node or ``others``."""
-    # The name may come from any participant, and comparing a long one would take seconds.
-    name = name[:_LONGEST_NAME]
-    near = difflib.get_close_matches(name, [*node.get_parameters_by_prefix(''), *others], 1, 0.0)
+    near = nearest(name, [*node.get_parameters_by_prefix(''), *others])
     return BadInputError(
-        f'parameter {name} does not exist: expected one of the {node.get_name()}, such as '
-        f'{near[0]}')
+        f'parameter {name[:_LONGEST_NAME]} does not exist: expected one of the {node.get_name()}, '
+        f'such as {near}')
 
 
 JOINTS = ParameterSpec(
