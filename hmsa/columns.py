@@ -17,7 +17,7 @@ from hmsa.files import read_at_most
 Array = NDArray[np.float64]
 
 _SEPARATORS = (';', '\t', ',', '|')
-_STRONGEST = 5.0  # flux density in T
+_STRONGEST = 5.0  # maximum flux density of a coil in T
 _LARGEST_FILE = 512 * 1024 * 1024
 # The first unit of each quantity is the default.
 _UNITS = {
@@ -83,7 +83,7 @@ class _Place:
 
 
 def check_flux_densities(source: object, levels: Array) -> None:
-    """Raise `BadInputError` for flux densities in T that no coil has, as of a column in mT."""
+    """Raise `BadInputError` for more T than any coil has, such as mT read as T."""
     most = float(np.nanmax(np.abs(levels), initial=0.0))
     if most > _STRONGEST:
         raise BadInputError(
