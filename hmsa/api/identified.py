@@ -36,7 +36,7 @@ class Identified:
         The complete result: values, covariance, fit residuals and verdict.
     actuator : Actuator
         The actuator with these values and the given coil; use it only if the verdict is
-        ``identified``.
+        ``identified``. If no actuator can have the values of a rejected fit, that of the start.
 
     Examples
     --------
