@@ -184,7 +184,7 @@ sys.exit(main(sys.argv[1:]))
 
 
 def test_nodes_import_nothing_while_they_move_an_actuator_and_judge(ros, start):
-    # An import takes up to 0.1 s, during which no command is sent.
+    # No command is sent during an import, which takes 20 ms and more.
     controller = start.python(
         '-c', LATE_IMPORTS, 'controller', '--ros-args', '-p', 'feedback:=cautious',
         '-p', 'publish_rate:=1000.0', '-p', 'mismatch.shear_modulus:=0.95')

@@ -197,7 +197,7 @@ def _usable(
             return stamps[:0], values[:0], 'the sensor shows no numbers'
         stamps, values = stamps[finite], values[finite]
     if not (stamps[1:] > stamps[:-1]).all():
-        # Not by np.unique, whose first call imports numpy.ma: 0.1 s without a command.
+        # Not by np.unique, whose first call imports numpy.ma: 20 ms without a command.
         order = np.argsort(stamps, kind='stable')
         first = order[np.append(True, np.diff(stamps[order]) > 0)]
         stamps, values = stamps[first], values[first]

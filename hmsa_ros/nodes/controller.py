@@ -178,7 +178,7 @@ class Cycles:
 
     def _figures(self, name: str, spent: NDArray[np.int64]) -> dict[str, object]:
         """Return median, 99 % quantile and maximum of recent processor times in us."""
-        # Not by np.quantile, whose first call imports numpy.ma: 0.1 s without a command.
+        # Not by np.quantile, whose first call imports numpy.ma: 20 ms without a command.
         seen = np.sort(spent[:max(self.count, 1)])
         return {f'{name}_{key}_us': f'{float(seen[round(x * (len(seen) - 1))]) / 1e3:.1f}'
                 for key, x in (('p50', 0.5), ('p99', 0.99), ('largest', 1.0))}
