@@ -1,6 +1,7 @@
 """The complete demo: real processes over DDS, with one core loaded, evaluated from its bag."""
 
 import json
+import os
 from pathlib import Path
 import signal
 
@@ -85,6 +86,25 @@ def test_an_interrupted_demo_ends_its_processes_and_leaves_a_readable_bag(
     if moment == 'running the sequence':
         with next(out.glob('run/*.mcap')).open('rb') as file:
             assert make_reader(file).get_summary() is not None
+
+
+@pytest.mark.slow
+def test_a_planner_that_stands_still_for_longer_than_its_lead_time_has_a_second_run(
+        start, tmp_path, wait_until):
+    out = tmp_path / 'out'
+    demo = start.hmsa('demo', '--out', str(out), '--json')
+    wait_until(lambda: 'end of the sequence, 2 s' in demo.stderr, 'the first move', DEMO_SECONDS)
+    planner, = (x for x in _children(demo.popen.pid)
+                if b'\0planner\0' in Path(f'/proc/{x}/cmdline').read_bytes())
+    os.kill(planner, signal.SIGSTOP)
+    # Three lead times later, at 0.02 of real time.
+    wait_until(lambda: 'end of the sequence, 9 s' in demo.stderr, 'the stall', DEMO_SECONDS)
+    os.kill(planner, signal.SIGCONT)
+    assert demo.wait(2.0 * DEMO_SECONDS) == 0, demo.output
+    note, = json.loads(demo.stdout)['notes']
+    assert f'(bag kept in {out / "late_1"})' in note
+    assert (out / 'late_1' / 'run_0.mcap').exists()
+    _check_bag(out / 'run')
 
 
 def _children(pid: int) -> list[int]:

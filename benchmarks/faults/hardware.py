@@ -26,8 +26,9 @@ _BEAT = 0.05
 _LEAD = 200_000_000
 # Timeouts in s: the driver's watchdog, a call, and the firmware's watchdog.
 _TIMEOUT, _CALL, _FIRMWARE = 0.5, 0.5, 0.4
-# Timeout in s of a call where the fault is not a call that hangs: a busy host is none either.
-_PATIENT_CALL = 5.0
+# Timeout in s of a call where the fault is not a call that hangs: nor is a host that halts the
+# board, by up to 5 s.
+_PATIENT_CALL = 15.0
 _STALL = 1.2  # time in s for which a process is stopped
 # Allowed time in s for a driver to end on request, and for one whose call hangs.
 _PROMPT, _SOON = 3.0, 5.0
