@@ -9,7 +9,7 @@ import pytest
 from hmsa.errors import BadInputError
 from hmsa.identification.files import read_belief
 from hmsa.model.creep import Creep
-from hmsa.motion import subsets
+from hmsa.motion import subset_inverses, subsets
 from hmsa.planning.planner import Options as PlannerOptions
 from hmsa_lab.adapt.estimator import Estimator, EstimatorOptions
 from hmsa_lab.adapt.hypotheses import Evidence, Hypotheses
@@ -363,6 +363,13 @@ def test_the_systems_of_subsets_are_solved_as_by_numpy():
         np.testing.assert_allclose(solved[some], np.linalg.solve(part, right[some]), rtol=1e-9)
         assert np.all(solved[~some] == right[~some])
         assert size == pytest.approx(np.linalg.slogdet(part)[1], rel=1e-12, abs=1e-12)
+    weights, total, expected = random.random(40), np.ones((7, 7)), np.ones((7, 7))
+    subset_inverses(matrix, varies, weights, total)
+    for some, weight in zip(varies, weights.tolist(), strict=True):
+        expected[np.ix_(some, some)] += weight * np.linalg.inv(matrix[np.ix_(some, some)])
+    np.testing.assert_allclose(total, expected, rtol=1e-9)
     subsets(matrix, varies[:0], found[:0], log_det[:0])
     with pytest.raises(ValueError, match='fit each other'):
         subsets(matrix, varies, found[:39], log_det)
+    with pytest.raises(ValueError, match='fit each other'):
+        subset_inverses(matrix, varies, weights, total[:6])

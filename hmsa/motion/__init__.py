@@ -23,6 +23,7 @@ from hmsa.motion._motion import (
     smooth,
     solve,
     staircase,
+    subset_inverses,
     subsets,
     trail,
     turning_point,
@@ -35,7 +36,8 @@ __all__ = [
     'accelerations', 'critical_zeta', 'damping', 'elastic_energy', 'elastic_force',
     'elastic_stiffness', 'equilibrium_stretch', 'evaluate', 'flow_rates', 'follow',
     'mass', 'natural_frequency', 'sample', 'smooth', 'solve', 'staircase',
-    'subsets', 'trail', 'turning_point', 'two_step', 'two_step_batch', 'two_step_late']
+    'subset_inverses', 'subsets', 'trail', 'turning_point', 'two_step', 'two_step_batch',
+    'two_step_late']
 
 #: Statuses of a turning point: found; approach to an equilibrium instead; out of steps; too close
 #: to a limiting stretch to be resolved. Those of `follow` are the first and the third.

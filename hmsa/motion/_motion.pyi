@@ -59,3 +59,6 @@ def staircase(
 # Solve for each subset of the unknowns, in place; compute the logarithms of the determinants.
 def subsets(
     matrix: Array, varies: NDArray[np.bool_], values: Array, log_dets: Array, /) -> None: ...
+# Add the inverses over subsets of the unknowns, 0 elsewhere, with weights, to a matrix.
+def subset_inverses(
+    matrix: Array, varies: NDArray[np.bool_], weights: Array, out: Array, /) -> None: ...

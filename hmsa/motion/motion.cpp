@@ -264,8 +264,22 @@ Nothing subsets(Numbers matrix, Array<const bool> varies, Results values, Result
     const int rows = log_dets.count, count = rows ? varies.count / rows : 0;
     if (fit(!rows || (count <= most_subset && matrix.count == count * count && varies.count == rows * count
             && values.count == rows * count)))
+        for (int i = 0; i < rows; i++) {
+            const Subset subset(count, matrix.data, varies.data + i * count);
+            subset.solve(values.data + i * count);
+            log_dets[i] = subset.log_det();
+        }
+    return {};
+}
+// Adds the inverses over subsets of the unknowns, with weights, to a matrix.
+Nothing subset_inverses(Numbers matrix, Array<const bool> varies, Numbers weights, Results out)
+{
+    const int rows = weights.count, count = rows ? varies.count / rows : 0;
+    if (fit(!rows || (count <= most_subset && matrix.count == count * count && varies.count == rows * count
+            && out.count == matrix.count)))
         for (int i = 0; i < rows; i++)
-            log_dets[i] = solve_subset(count, matrix.data, varies.data + i * count, values.data + i * count);
+            if (weights[i] != 0)
+                Subset(count, matrix.data, varies.data + i * count).add_inverse(weights[i], count, out.data);
     return {};
 }
 
@@ -284,7 +298,7 @@ PyMethodDef methods[] = {
     method<two_step_batch>("two_step_batch"), method<follow>("follow"),
     method<sample_of>("sample"), method<flow_rates>("flow_rates"), method<trail_of>("trail"),
     method<solve>("solve"), method<smooth>("smooth"), method<staircase>("staircase"),
-    method<subsets>("subsets"), {nullptr, nullptr, 0, nullptr}};
+    method<subsets>("subsets"), method<subset_inverses>("subset_inverses"), {nullptr, nullptr, 0, nullptr}};
 PyModuleDef module = {PyModuleDef_HEAD_INIT, "_motion", nullptr, 0, methods, nullptr, nullptr, nullptr, nullptr};
 }  // namespace
 

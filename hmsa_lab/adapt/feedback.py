@@ -29,9 +29,9 @@ from hmsa_ros.runtime.records import (
 
 # Interval in ns at which the estimate is published.
 _REPORT = 200_000_000
-# Minimum delay of the next update, as a multiple of the time that an update or a correction took,
-# for each joint.
-_IDLE = 6
+# Minimum delay of the next update, as a multiple of the time that an update or a correction took:
+# that of one joint, and for each joint, so that all together take less than half of the time.
+_IDLE, _SHARED = 6, 2
 # Largest factor of that delay after updates have kept commands waiting, and its decay with each
 # update.
 _SELDOM, _OFTENER = 32.0, 0.8
@@ -188,7 +188,7 @@ class Feedback(Follower):
 
     def spent(self, joint: AdaptiveJoint, time: int) -> None:
         """Delay the next update, since work for a joint has taken a time in ns."""
-        rest = round(_IDLE * len(self.joints) * self._seldom * time)
+        rest = round(max(_IDLE, _SHARED * len(self.joints)) * self._seldom * time)
         joint.not_before = max(joint.not_before, self._clock() + rest)
 
     def update(self, now: int) -> bool:

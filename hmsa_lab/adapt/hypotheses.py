@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmsa.model.equations import Array
-from hmsa.motion import subsets
+from hmsa.motion import subset_inverses, subsets
 
 # Prior improbability of a suspect that is not named, as a logarithm, and the gain of log evidence
 # above which the set of estimated suspects changes.
@@ -191,8 +191,10 @@ class Evidence:
         counts = np.flatnonzero((weight > _UNLIKELY) | (np.arange(len(sets)) == best))
         weight = weight[counts] / float(np.sum(weight[counts]))
         apart = found.step[counts] - found.step[best]
-        square = np.einsum(
-            'k,kij->ij', weight * (counts != best), inverse(self.matrix, found.loose[counts]))
+        square = (weight[:, None] * apart).T @ apart
+        subset_inverses(
+            np.ascontiguousarray(self.matrix), found.loose[counts], weight * (counts != best),
+            square)
         # Probabilities for plans.
         likely = weight
         for some in (counts == best, self.suspects.kinds[counts] == self.suspects.kinds[best]):
@@ -200,8 +202,7 @@ class Evidence:
                 likely = weight * some / share
                 break
         return sets[best], Others(
-            float(weight @ (counts == best)), weight @ apart,
-            square + (weight[:, None] * apart).T @ apart,
+            float(weight @ (counts == best)), weight @ apart, square,
             likely @ (self._without_gain(found, counts) - found.step[best]))
 
     def best(self) -> float:
@@ -245,16 +246,11 @@ class Evidence:
         beyond = np.any(
             (found.step < self.low - 1e-12) | (found.step > self.high + 1e-12), axis=1)
         found.evidence[beyond] = -math.inf
-        most = float(np.max(found.evidence))
         # Bounds hardly increase the evidence.
-        places = np.flatnonzero(beyond & (evidence > most + math.log(_UNLIKELY)))
-        bounded = self._bounded(sought[places], rest)
-        for i in np.argsort(-evidence[places]).tolist():
-            if evidence[places[i]] <= most + math.log(_UNLIKELY):
-                break
-            for those, one in zip(found, bounded, strict=True):
-                those[places[i]] = one[i]
-            most = max(most, float(bounded.evidence[i]))
+        places = np.flatnonzero(
+            beyond & (evidence > float(np.max(found.evidence)) + math.log(_UNLIKELY)))
+        for those, one in zip(found, self._bounded(sought[places], rest), strict=True):
+            those[places] = one
         return found
 
     def _bounded(self, sought: NDArray[np.bool_], rest: Array) -> Explained:
@@ -289,12 +285,10 @@ def _solution(
 
 
 def inverse(matrix: Array, sought: NDArray[np.bool_]) -> Array:
-    """Return the inverse over the estimated part, 0 elsewhere; shapes (..., q) are batched."""
-    inner = np.linalg.inv(np.where(
-        sought[..., :, None] & sought[..., None, :], matrix, np.eye(len(matrix))))
-    found: Array = np.where(
-        sought[..., :, None] & sought[..., None, :], 0.5 * (inner + inner.swapaxes(-1, -2)), 0.0)
-    return found
+    """Return the inverse over the estimated part, 0 elsewhere."""
+    both = np.outer(sought, sought)
+    inner = np.linalg.inv(np.where(both, matrix, np.eye(len(matrix))))
+    return np.where(both, 0.5 * (inner + inner.T), 0.0)
 
 
 def optimum(
