@@ -656,6 +656,42 @@ def test_jump_ahead_while_a_plan_runs_is_planned_anew():
     assert rig.residual(1.4) < 0.2 * RESIDUAL
 
 
+def test_own_level_whose_report_comes_after_it_was_found_lost_is_no_foreign_one():
+    rig = Rig(settings=replace(QUIET, heartbeat_period=20 * MS))
+    rig.runtime.request(trajectory((1.2, 4 * HOLD), (1.3, 20 * HOLD)))
+    rig.run(START + LEAD + 3 * HOLD)
+    reports, applied = [], rig.runtime.applied
+    rig.runtime.applied = lambda *report: reports.append(report)
+    rig.run(START + LEAD + 7 * HOLD)
+    assert rig.status.replanned > 0
+    rig.runtime.applied = applied
+    for report in reports:
+        applied(*report)
+    rig.run(START + LEAD + 20 * HOLD)
+    assert not any('not commanded' in x for x in rig.notes())
+    assert rig.residual(1.3) < 0.2 * RESIDUAL
+
+
+def test_level_is_not_lost_while_receipts_wait_to_be_read_as_its_report_may():
+    rig = Rig(settings=replace(QUIET, heartbeat_period=20 * MS))
+    rig.runtime.received('a', START, 0, cut_off=False)
+    rig.runtime.request(trajectory((1.2, 4 * HOLD), (1.3, 20 * HOLD)))
+    rig.run(START + LEAD + 3 * HOLD)
+    rig.runtime.received('a', rig.now, rig.sent[-1][1].stamp, cut_off=False)
+    reports, applied = [], rig.runtime.applied
+    rig.runtime.applied = lambda *report: reports.append(report)
+    while rig.now < START + LEAD + 7 * HOLD:
+        rig.run(rig.now + 10 * MS)
+        rig.show(rig.now, rig.plant.stretch)
+    assert reports
+    rig.runtime.received('a', rig.now, rig.sent[-1][1].stamp, cut_off=False)
+    for report in reports:
+        applied(*report)
+    rig.run(START + LEAD + 20 * HOLD)
+    assert rig.status.replanned == 0
+    assert rig.residual(1.3) < 0.2 * RESIDUAL
+
+
 def test_foreign_level_is_noted_and_planned_for():
     rig = Rig()
     rig.runtime.request(trajectory((1.2, HOLD)))

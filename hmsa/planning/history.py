@@ -64,7 +64,7 @@ class History:
         levels, first = self.levels, self.known + 1
         for i in reversed(range(first, self.sent)):
             if (levels[i].stamp <= now
-                    and (levels[i].stamp <= lost or self._near(
+                    and (levels[i].stamp <= lost or self.near(
                         levels[i].flux_density, levels[self.known].flux_density))
                     and self._changes(range(first, i + 1))):
                 return i + 1 - first
@@ -88,7 +88,7 @@ class History:
         # Changes take effect in the order of sending. Levels before the reported one have already
         # been in effect or never will; later ones come no earlier.
         levels, known = self.levels, self.known
-        if stamp < levels[known].stamp or stamp == levels[known].stamp and self._near(
+        if stamp < levels[known].stamp or stamp == levels[known].stamp and self.near(
                 flux_density, levels[known].flux_density):
             return self, None
         sent = range(known + 1, self.sent)
@@ -104,7 +104,7 @@ class History:
         else:
             rest = known + 1 + sum(levels[i].stamp < stamp for i in sent)
             taken = levels[rest - 1]
-            if self._near(taken.flux_density, flux_density):
+            if self.near(taken.flux_density, flux_density):
                 return self, None
             # A command from another publisher, or a watchdog.
             deviation = Deviation(lost=self._changes(range(known + 1, rest)), foreign=True)
@@ -156,10 +156,10 @@ class History:
         levels = self.levels
         # Almost always the next one, among perhaps hundreds along a path.
         for i in sent:
-            if abs(levels[i].stamp - stamp) <= tolerance and self._near(
+            if abs(levels[i].stamp - stamp) <= tolerance and self.near(
                     levels[i].flux_density, flux_density):
                 return i
-        same = [i for i in sent if self._near(levels[i].flux_density, flux_density)]
+        same = [i for i in sent if self.near(levels[i].flux_density, flux_density)]
         for i in same:
             if levels[i].stamp < stamp and levels[i].flux_density != levels[i - 1].flux_density:
                 return i
@@ -179,15 +179,15 @@ class History:
         # Levels of a watchdog or another publisher come later, or are 0 T.
         soon = stamp - level.stamp <= max(options.lead_time, level.model.ns(1.0))
         short = _beyond(asked, flux_density) and not (
-            self._near(asked, flux_density) or self._near(0.0, flux_density))
+            self.near(asked, flux_density) or self.near(0.0, flux_density))
         return due[-1] if soon and short else None
 
     def _changes(self, places: Sequence[int]) -> int:
         """Return how many of the levels differ from the one before."""
-        return sum(not self._near(
+        return sum(not self.near(
             self.levels[i].flux_density, self.levels[i - 1].flux_density) for i in places)
 
-    def _near(self, one: float, other: float) -> bool:
+    def near(self, one: float, other: float) -> bool:
         """Return whether two levels in T are equal for hardware that rounds them."""
         if _same(one, other):
             return True

@@ -240,6 +240,10 @@ class RunningPlan:
         first = self._history.known + 1
         self._leave_out(first, first + self._history.unheard(stamp, stamp), stamp)
 
+    def near(self, one: float, other: float) -> bool:
+        """Return whether two levels in T are equal for hardware that rounds them."""
+        return self._history.near(one, other)
+
     def applied(self, stamp: int, flux_density: float, tolerance: int) -> Deviation | None:
         """Record a change of level as `History.with_news` does; None if it is already known."""
         self._history, deviation = self._history.with_news(stamp, flux_density, tolerance)

@@ -89,13 +89,13 @@ class CommandLink:
                 self.fresh.discard(name)
                 self._hand_out(name, level.stamp, level.flux_density, now, level=True)
                 self.sent += 1
-                self._deviations.sent(name, level.stamp, now)
 
     def _hand_out(
             self, name: str, stamp: int, flux_density: float, now: int, *,
             level: bool = False) -> None:
         self.deliver(Send(name, stamp, flux_density))
         self.receipts.sent(name, stamp, now, level=level)
+        self._deviations.sent(name, stamp, flux_density, now, level=level)
 
     def beat(self, now: int, *, finds_lost: bool) -> None:
         """

@@ -1,5 +1,6 @@
 """Late, lost and foreign commands, and the new plans that they require."""
 
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -35,8 +36,9 @@ _UNSEEN, _SILENT = 2 * NANOSECONDS, 10 * NANOSECONDS
 _PAUSE = 20_000_000
 # Time in ns until receipts show why commands are late; there are five a second.
 _CAUSE = 400_000_000
-# Number of commands per joint whose sending time is stored.
-_REMEMBERED = 64
+# Number of commands per joint whose sending time is stored, and of those whose level is: a second
+# of a path at 1 kHz.
+_REMEMBERED, _COMMANDED = 64, 1000
 
 
 @dataclass
@@ -72,6 +74,8 @@ class Deviations:
         self._again: dict[str, int] = {}
         # By joint and timestamp in ns: when a command was sent.
         self._sent: dict[str, dict[int, int]] = {}
+        # By joint: commanded levels in T, from the last one that took effect on.
+        self._commanded: dict[str, deque[float]] = {}
         # Messages about saturated amplifiers, and the limits as given.
         self._saturated: dict[str, tuple[str, Options]] = {}
         # Joints that may deviate, and the timestamp of the unconfirmed command.
@@ -125,8 +129,14 @@ class Deviations:
 
     # -- commands and their effects -------------------------------------------------------------
 
-    def sent(self, joint: str, stamp: int, now: int) -> None:
-        """Record that a command was sent."""
+    def sent(
+            self, joint: str, stamp: int, flux_density: float, now: int, *, level: bool) -> None:
+        """Record that a command was sent: a new ``level``, or one again."""
+        commanded = self._commanded.setdefault(joint, deque(maxlen=_COMMANDED))
+        if not commanded or commanded[-1] != flux_density:
+            commanded.append(flux_density)
+        if not level:
+            return
         sent = self._sent.setdefault(joint, {})
         sent.pop(stamp, None)
         sent[stamp] = now
@@ -143,6 +153,7 @@ class Deviations:
         self.newest[joint] = stamp, flux_density
         self._ages[joint] = max(now - stamp, 0)
         tolerance, planner = settings.lateness_tolerance, self._group.planners[joint]
+        own = self._commands(joint, flux_density)
         found = self._group.applied(joint, stamp, flux_density, tolerance)
         if found is None:
             return
@@ -165,10 +176,19 @@ class Deviations:
             self.astray.add(joint)
         if found.asked is not None:
             self._saturates(joint, found.asked, flux_density)
-        elif found.foreign and self._foreign_due():
+        elif found.foreign and not own and self._foreign_due():
             self._note(f'joint {joint}: {flux_density:g} T took effect but was not commanded')
         elif found.late > tolerance:
             self._report_advice()
+
+    def _commands(self, joint: str, flux_density: float) -> bool:
+        """Return whether a level in T that took effect was commanded, since the last one did."""
+        # Its command may have been found lost, or replaced, before its effect was reported.
+        commanded, near = self._commanded.get(joint, deque()), self._group.planners[joint].near
+        place = next((i for i, x in enumerate(commanded) if near(x, flux_density)), None)
+        for _ in range(place or 0):
+            commanded.popleft()
+        return place is not None
 
     def _saturates(self, joint: str, asked: float, reached: float) -> None:
         """Plan within the amplifier's actual limit until the next request."""
@@ -244,8 +264,8 @@ class Deviations:
                 reported, reported - planner.delay - self._quarter(planner))
             if stamp is None:
                 continue
-            if before.get(name) != stamp:
-                # The report may still wait to be read.
+            if before.get(name) != stamp or not self._receipts.since(name, stamp):
+                # The report may still wait to be read, as may a receipt from after it.
                 self._suspected[name] = stamp
                 continue
             planner.drop_unheard(stamp)
