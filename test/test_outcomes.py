@@ -55,7 +55,7 @@ def test_each_setpoint_of_each_joint_has_one_outcome_with_what_was_asked_and_pla
     bench = Bench(('a', 'b'))
     bench.send((1.1, 300), (1.2, 600), name='x')
     bench.wait(1200)
-    assert len(newest(bench.all)) == 4
+    assert len(newest(bench.all)) == len(bench.all) == 4
     for joint in 'a', 'b':
         first, second = (x for x in newest(bench.all) if x.joint == joint)
         asked = first.setpoint

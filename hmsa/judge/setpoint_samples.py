@@ -47,6 +47,7 @@ class SetpointSamples:
             doing: Doing = here) -> None:
         self.setpoint = setpoint
         self.found: Finding | None = None
+        self._told: Finding | None = None  # that returned last by `judge`
         self.over = False
         self.unreported = False  # whether it is missed and this is not reported yet
         self.news = False  # whether judged samples await an audit
@@ -101,7 +102,8 @@ class SetpointSamples:
             return
         self._arrived = self.found if corrected and self.found is not None and (
             self.found.arrived) else None
-        self.found, self.over, self.unreported = None, False, False
+        self.found = self._told = None
+        self.over = self.unreported = False
         self._begin_at(arrival)
 
     @property
@@ -111,7 +113,8 @@ class SetpointSamples:
 
     def cut(self, time: int) -> None:
         """Judge it by the samples before a time in ns, at which another takes its place."""
-        self._cut = time
+        # Its outcome is another then, also if the finding is not.
+        self._cut, self._told = time, None
 
     def miss(self, reason: str) -> None:
         """Record that the setpoint is not carried out, whatever the samples have shown so far."""
@@ -250,7 +253,10 @@ class SetpointSamples:
             found = self._arrived
         self.found = found
         same = before is not None and before.verdict is found.verdict
-        return None if same and not self.over else found
+        if found == self._told or same and not self.over:
+            return None
+        self._told = found
+        return found
 
     def rests(self, now: int, *, observable: bool) -> bool:
         """Return whether there is nothing to judge at a time in ns."""
