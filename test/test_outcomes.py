@@ -110,6 +110,27 @@ def test_a_stop_ends_setpoints_and_has_no_outcome_itself():
     assert bench.told == [('x', 1, 'arrived', 'stopped'), ('x', 2, None, 'stopped')]
 
 
+def test_a_planner_that_ends_tells_of_each_setpoint_that_it_has_not_told_of():
+    bench = Bench()
+    bench.send((1.1, 300), (1.2, 600), (1.3, 900), (1.0, 1200), name='x')
+    bench.wait(400)
+    for outcome in bench.loop.runtime.close():
+        bench.loop.deliver(outcome)
+    assert bench.told == [
+        ('x', 1, 'arrived', ''), ('x', 2, None, 'inactive'), ('x', 3, None, 'inactive')]
+    last = newest(bench.all)[-1]
+    assert (last.setpoint.number, last.through) == (3, 4)
+    assert len(bench.all) == 3
+
+
+def test_a_planner_that_ends_after_a_request_repeats_no_outcome():
+    bench = Bench()
+    bench.send((1.1, 300), (1.2, 600), name='x')
+    bench.wait(900)
+    assert bench.loop.runtime.close() == []
+    assert bench.told == [('x', 1, 'arrived', ''), ('x', 2, 'arrived', '')]
+
+
 def test_a_cut_off_names_itself_as_the_reason():
     bench = Bench()
     bench.send((1.1, 300), (1.2, 600), (1.3, 900), name='x')

@@ -123,6 +123,12 @@ class LinkedPlanner(PlannerNode):
         self.serve(lambda: True)
         super().cleanup()
 
+    def close(self) -> None:
+        """Publish the waiting messages too."""
+        super().close()
+        while self._waiting and self.context.ok():
+            self._publish(self._waiting.popleft())
+
     def _take(self, outputs: Iterable[Output]) -> None:
         for output in outputs:
             if isinstance(output, Send) and self.plant is not None:

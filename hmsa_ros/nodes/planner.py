@@ -289,7 +289,9 @@ class PlannerNode(ManagedNode):
         self._samples = self._newest = None
 
     def close(self) -> None:
-        """End the estimation process."""
+        """Publish the outcomes of setpoints that have none, and end the estimation process."""
+        if self._channels and self.context.ok():
+            self._take(self._runtime.close())
         self._offload.close()
 
     # -- in ------------------------------------------------------------------------------------

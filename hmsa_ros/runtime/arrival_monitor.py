@@ -337,6 +337,17 @@ class ArrivalMonitor:
             plan = planner.plan
             self._begin(name, replace(plan, kept=len(plan.segments)), plan)
 
+    def close(self) -> None:
+        """Publish an outcome of each setpoint that has none, since the planner ends."""
+        now = self._around.clock()
+        self.follow(now)
+        for joint in self._joints.values():
+            if not joint.ended:
+                joint.until, joint.ended = now, Code.INACTIVE
+            self._end(joint, now, joint.ended, now)
+        self._joints.clear()
+        self.restart()
+
     def dropped(self, code: Code, now: int) -> None:
         """Record that plans that now have no setpoints were dropped, with a code of a status."""
         self._dropped = code

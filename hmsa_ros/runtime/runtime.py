@@ -389,6 +389,11 @@ class Runtime:
         self._stops.drop()
         self._leave(now)
 
+    def close(self) -> list[Output]:
+        """End, and return the outcomes of setpoints that have none."""
+        self._watch.close()
+        return self._taken()
+
     def _leave(self, now: int) -> None:
         """Once inactive, forget where the joints are when the last level that was sent applies."""
         if not self.active and all(
