@@ -10,6 +10,7 @@ import pytest
 from trajectory_msgs.msg import JointTrajectory
 
 from hmsa.cli import main, terminal
+from hmsa.errors import HmsaError
 from hmsa_ros.clients.client import PlannerClient
 from hmsa_ros.clients.link import Link
 from hmsa_ros.nodes.planner import PlannerNode
@@ -90,6 +91,31 @@ def test_a_stop_beside_another_client_is_sent_before_anything_else_is_known(
     assert len(requests) > 1
     assert len({x.name for x in requests}) == 1
     assert 'the planner has not answered the stop' in failure
+
+
+@pytest.mark.ros
+def test_a_client_that_waits_in_vain_says_what_it_knows_and_how_to_stop_the_request(
+        ros, ros_env, serve, monkeypatch):
+    node = serve(PlannerNode, '-r', '__ns:=/a').nodes[0]
+    request = node._runtime.request
+    with PlannerClient(namespace='/a') as client:
+        client.find_planner()
+        known = 'which may still be carried out: stop it with hmsa stop --namespace /a; last'
+        monkeypatch.setattr(node._runtime, 'request', lambda request: None)
+        monkeypatch.setattr(client, 'timeout', 0.1)
+        with pytest.raises(HmsaError) as caught:
+            client.send_sequence([(1.1, 60.0)])
+        assert str(caught.value) == (
+            f'waited 0.1 s: the planner did not acknowledge the request, {known} status: idle, no '
+            'request yet')
+        monkeypatch.setattr(node._runtime, 'request', request)
+        monkeypatch.setattr(client, 'timeout', 20.0)
+        verdict = client.send_sequence([(1.1, 60.0)])
+        client.spin_until(lambda: client.verdict.setpoint == 1, 'the move')
+        with pytest.raises(HmsaError) as caught:
+            client.follow(verdict, timeout=0.1)
+        assert 'did not report the end of the sequence' in str(caught.value)
+        assert f'{known} status: setpoint 1 of 1, ' in str(caught.value)
 
 
 @pytest.mark.slow

@@ -220,7 +220,9 @@ class Desk:
             self._client.send_again()
         if not self._received and now - self._sent > _GONE_SECONDS:
             self._received = True
-            self._notify('the planner did not reply to the request: send it again', 2)
+            self._notify(
+                'the planner did not acknowledge the request, which may still be carried out: '
+                'stop it, or send it again', 2)
         self._look_at_pages(now)
         if self._server.coil_off.is_set():
             self._server.coil_off.clear()

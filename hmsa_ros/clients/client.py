@@ -234,7 +234,8 @@ class PlannerClient(Link):
             request = self.publish(setpoints, levels, path)
             self.spin_until(
                 lambda request=request: self.verdict.on(request) is not None,  # type: ignore[misc]
-                'the planner did not reply with a verdict', self.send_again,
+                lambda: self._may_run('the planner did not acknowledge the request'),
+                self.send_again,
                 awaited="the planner's verdict: it plans, or waits for plant, driver, samples or "
                 "feedback")
             verdict = self.verdict.on(request)
@@ -248,6 +249,14 @@ class PlannerClient(Link):
                     + '; name the joints with --joint' * (verdict.code == Code.UNKNOWN_JOINT))
             self._executor.spin_once(timeout_sec=SLICE_SECONDS)
             sleep(SLICE_SECONDS)
+
+    def _may_run(self, unknown: str) -> str:
+        """Return what is known of the request, and how to stop it."""
+        now, space = self.verdict, self._namespace and f' --namespace {self._namespace}'
+        at = f'setpoint {now.setpoint} of {now.setpoints}, ' if now.setpoint else ''
+        return (
+            f'{unknown}, which may still be carried out: stop it with hmsa stop{space}; last '
+            f'status: {at}{now.state}, {now.unheard or now.message}')
 
     def publish(
             self, setpoints: Sequence[tuple[float | Sequence[float], float]],
@@ -355,7 +364,7 @@ class PlannerClient(Link):
 
         with _slower_time(self.node, self.timeout) as time:
             self.spin_until(
-                done, 'the sequence has not finished',
+                done, lambda: self._may_run('the planner did not report the end of the sequence'),
                 None if each is None else lambda: each(self.verdict), timeout, time,
                 'the end of the sequence')
         end = self.verdict

@@ -213,7 +213,7 @@ class TemporaryNode:
         leave(self.node)
 
     def spin_until(
-            self, condition: Callable[[], bool], failure: str,
+            self, condition: Callable[[], bool], failure: str | Callable[[], str],
             each: Callable[[], None] | None = None, timeout: float | None = None,
             time: Callable[[], float] = monotonic, awaited: str = '') -> None:
         """
@@ -235,7 +235,8 @@ class TemporaryNode:
         with under_way(f'waiting{longest} for {awaited}') if awaited else nullcontext():
             while not condition():
                 if time() > deadline:
-                    raise HmsaError(f'waited {timeout:g} s: {failure}')
+                    words = failure if isinstance(failure, str) else failure()
+                    raise HmsaError(f'waited {timeout:g} s: {words}')
                 ENDING.check()
                 self._executor.spin_once(timeout_sec=SLICE_SECONDS)
                 if each is not None:
