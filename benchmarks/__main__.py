@@ -24,7 +24,8 @@ there, for five; beam plays commands on an exact rod, for three; beam-identifica
 recordings of this rod, for five.
 repeats plays what `hmsa learn` makes of repeats on finite elements and an exact rod, for half an
 hour.
-modes identifies secondary modes from recordings of these elements, for half an hour.
+modes identifies secondary modes from recordings of these elements, for half an hour. adapting
+moves up to 64 joints with feedback, in a minute.
 A page is a Markdown file; a table replaces the text between its marks ``<!-- begin NAME -->`` and
 ``<!-- end NAME -->``.
 """
@@ -69,10 +70,10 @@ TABLES |= {
     'waves': ('continuum.waves',),
     'repeats': ('repeats.compare',), 'beam': ('beam.compare', 'beam.sequences'),
     'beam-identification': ('beam.identified',),
-    'modes': ('continuum.covered', 'continuum.identified')}
+    'modes': ('continuum.covered', 'continuum.identified'), 'adapting': ('joints.adapting',)}
 LONG = tuple(TABLES)[len(NAMES):]
 _NEED_ROS = ('preemption', 'joints', 'controller', 'recorder', 'player', 'crash', 'feedback',
-             'faults', 'soak')
+             'faults', 'soak', 'adapting')
 
 
 def main(arguments: list[str] | None = None) -> int:
