@@ -228,12 +228,14 @@ class Estimator:
                 self._window.begin * NANOSECONDS):
             self.screening.late += 1
             return False
-        place = bisect_left(self._pending, stamp, key=lambda x: x[0])
-        if self._taken(stamp) or (
-                place < len(self._pending) and self._pending[place][0] == stamp):
+        pending = self._pending
+        # Almost always the newest one.
+        place = len(pending) if not pending or pending[-1][0] < stamp else (
+            bisect_left(pending, stamp, key=lambda x: x[0]))
+        if place < len(pending) and pending[place][0] == stamp or self._taken(stamp):
             self.screening.repeated += 1
             return False
-        self._pending.insert(place, (stamp, stretch))
+        pending.insert(place, (stamp, stretch))
         # Without updates, as before the first move, only the newest samples are kept.
         limit = self.options.window * (1 if self._window is None else _WAITING)
         self.screening.late += len(self._pending[:-limit])
@@ -551,9 +553,11 @@ class Estimator:
         """Return whether the window has a sample with this timestamp; its times are rounded."""
         if self._window is None:
             return False
-        times, time = self._window.time, self._seconds(stamp)
-        place = int(np.searchsorted(times, time - 0.5 / NANOSECONDS))
-        return place < len(times) and float(times[place]) < time + 0.5 / NANOSECONDS
+        times, time = self._window.time, self._seconds(stamp) - 0.5 / NANOSECONDS
+        if not len(times) or times[-1] < time:
+            return False
+        place = int(np.searchsorted(times, time))
+        return float(times[place]) < time + 1.0 / NANOSECONDS
 
     def _unchanged(self, begin: int, end: int, units: float) -> bool:
         """Return whether no level changed from some time scales before a begin to an end."""
