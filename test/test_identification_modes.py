@@ -280,6 +280,17 @@ def test_what_is_freed_on_advice_is_said():
                for x in found.warnings)
 
 
+def test_what_a_mode_explains_as_well_as_freed_parameters_is_not_identifiable():
+    free = (*(x for x in DEFAULT_FREE if x != 'chain_limit'), 'stretch_gain', 'sensor_latency',
+            'viscoelastic_ratio', 'viscoelastic_time')
+    found = identify(recorded(
+        replace(BLOCK, modes=Modes((1.5,), (0.1,), (0.55,))), count=3, noise=2e-3), free,
+        actuator=BLOCK)
+    assert found.verdict == 'not_identifiable'
+    assert 'a second mode' in found.reason
+    assert '--free +modes' in found.reason
+
+
 def _elements(known, cells) -> Measurement:
     """Return a recording of coarse finite elements."""
     material, unit, dwell = known.nondimensional, known.time_unit, 8.0 * known.period

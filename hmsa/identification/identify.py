@@ -25,6 +25,7 @@ from hmsa.identification.initial_guess import begins_at_rest
 from hmsa.identification.intervals import estimates_of, Precision, precision_of, stamp_error
 from hmsa.identification.measurement import Measurement
 from hmsa.identification.modal import (
+    contested,
     ENOUGH,
     explained,
     lines_of,
@@ -46,12 +47,11 @@ from hmsa.model.residual import RESOLVED
 _MOST_SPREADS = 3
 # P-value of the test for whiteness below which residuals are certainly not white.
 _CERTAIN = 1e-4
-# Parameters that are freed because residuals advise it. Minimum of what a mode explains of their
-# effect, to be fitted in their place; excess of chi-squared that decides between the two; and
-# number of standard deviations that is no chance.
+# Parameters that are freed because residuals advise it; excess of chi-squared that decides between
+# them and a mode; and number of standard deviations that is no chance.
 _ADVISED = (GAIN, 'sensor_latency', 'coil_time_constant', 'constant_force', *(
     x for names in quantities.BRANCHES for x in names))
-_RIVAL, _WORSE, _SURE = 0.7, 10.0, 3.0
+_WORSE, _SURE = 10.0, 3.0
 # Size of a mode in standard deviations that rejects a fit alone.
 _CLEAR = 8.0
 # Residuals along the elastica in units of those with the shape of the first mode, below which a
@@ -214,15 +214,14 @@ def _challenged(
                 f'{GAIN}=VALUE+-STD'))
     if diagnosis.modal(best):
         return found
-    lines, by_others = lines_of(best, diagnosis.frequency_of(best), 1, added)
-    if not lines or lines[0].explained < _RIVAL * by_others:
-        return found
     kept = tuple(x for x in best.free if x not in added)
     values = {**best.values, **{
         x: quantities.QUANTITIES[x].default for x in added if x in quantities.QUANTITIES}}
     one = fit(best.recording, values, kept)
-    rival = None if one is None else _with_others(one, limit, len(quantities.SECONDARY))
-    if rival is None or not quantities.modes_of(rival.values):
+    if one is None or not contested(one, best):
+        return found
+    rival = _with_others(one, limit, len(quantities.SECONDARY))
+    if not quantities.modes_of(rival.values):
         return found
     scale = min(best.scale, rival.scale)
     excess = 2.0 * (loss(rival.residual, scale) - loss(best.residual, scale))
@@ -377,7 +376,7 @@ def _modes_left(
     leading = max((x.share for x in marks if x.found and x.remedy), default=0.0)
     distant = diagnosis.distant(best, whiteness(best.root * best.residual))
     if not quantities.modes_of(best.values) and not distant:
-        lines, _ = lines_of(best, diagnosis.frequency_of(best), 1)
+        lines = lines_of(best, diagnosis.frequency_of(best), 1)
         if not lines or lines[0].explained < leading:
             return (), []
     found = _with_others(best, limit, 2)
