@@ -20,6 +20,8 @@ from hmsa_ros.nodes.plant import PlantNode
 pytestmark = pytest.mark.ros
 
 TWO_PLANTS = '2 plants or drivers of joint actuator (/plant and /plant): stop one'
+# Few samples, since a process that was killed is waited for.
+RARELY = '-p', 'publish_rate:=100.0'
 TWO_PLANNERS = '2 planners (/planner and /planner): stop one'
 
 
@@ -52,12 +54,12 @@ class Asking:
 
 
 def test_second_plant_of_a_joint_is_refused_until_it_is_gone(ros, serve, start):
-    serve(PlannerNode, PlantNode)
+    serve(PlannerNode, PlantNode, *RARELY)
     asking = Asking(ros)
     other = ros_entities.publisher(ros.node, topics.JOINT_STATES)
     other.publish(JointState(name=['elbow'], position=[1.0]))
     asking.until(refused=False)
-    second = start.hmsa('plant')
+    second = start.hmsa('plant', '--ros-args', *RARELY)
     assert asking.until(refused=True).message == TWO_PLANTS
     ros.spin_until(lambda: all(
         x in asking.reports and asking.reports[x].level == DiagnosticStatus.ERROR
