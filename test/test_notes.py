@@ -62,7 +62,7 @@ def test_a_section_for_another_node_is_not_used_and_said(here, capsys):
         '/**: {ros__parameters: {actuator.remanence: 0.11}}\n'
         'planr: {ros__parameters: {actuator.remanence: 0.12}}\n'
         'left: {plant: {ros__parameters: {actuator.half_length: 0.02}}}\n', encoding='utf-8')
-    for words in (COMMANDS['excite'], ['plan', '1.01:1']):
+    for words in (COMMANDS['wave'], ['plan', '1.01:1']):
         assert main([*words, '--params-file', 'it.yaml']) == 0
         assert quick(capsys.readouterr().err) == (
             "hmsa: note: it.yaml: its section '/planr' is not used: expected /**, planner, plant "
