@@ -74,8 +74,9 @@ class Apart(Bench):
 
 
 @pytest.mark.parametrize(('when', 'by'), [
-    *((130, sign * x * MS) for x in (100, 500, 1000, 5000, 60_000, 3_600_000)
-      for sign in (1, -1)),
+    *((130, sign * x * MS) for x in (100, 500, 1000, 3_600_000) for sign in (1, -1)),
+    *(pytest.param(130, sign * x * MS, marks=pytest.mark.slow)
+      for x in (5000, 60_000) for sign in (1, -1)),
     (20, -5000 * MS), (20, 100 * MS), (2000, 5000 * MS), (2000, -5000 * MS)])
 def test_a_device_whose_clock_is_set_halts_the_plan_and_is_found_again(when, by):
     rig = Apart()
