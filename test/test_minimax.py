@@ -167,9 +167,10 @@ def test_the_least_longest_vector_is_that_of_linear_programming():
 
 
 @pytest.mark.parametrize(('delivery', 'share'), [
-    (Delivery(slew=3.0), 0.7), (Delivery(slew=1.0), 0.6), (Delivery(slew=0.3), 0.5),
-    (Delivery(lag=0.2), 0.3), (Delivery(lag=0.4), 0.2), (Delivery(slew=2.0, lag=0.2), 0.3),
-    (Delivery(period=0.05, slew=10.0, lag=0.1), 0.4)], ids=str)
+    (Delivery(slew=3.0), 0.7), (Delivery(slew=0.3), 0.5), (Delivery(lag=0.4), 0.2),
+    (Delivery(slew=2.0, lag=0.2), 0.3), (Delivery(period=0.05, slew=10.0, lag=0.1), 0.4),
+    *(pytest.param(*x, marks=pytest.mark.slow) for x in (
+        (Delivery(slew=1.0), 0.6), (Delivery(lag=0.2), 0.3)))], ids=str)
 def test_slow_ramps_and_a_lagging_field_leave_less_than_the_chain_too(delivery, share):
     request = MoveRequest(State(1.0), 1.4, PAPER, WIDE, delivery)
     chain, move = (get_shaper(x)(request) for x in ('robust', 'minimax'))
