@@ -18,7 +18,17 @@ import yaml
 from hmsa import Actuator, plugins
 from hmsa.errors import BadInputError
 from hmsa.interfaces.actuator import actuator_from
-from hmsa.interfaces.parameters import ACTUATOR, BLOCK, is_for, ParameterSpec, sections_of
+from hmsa.interfaces.parameters import (
+    ACTUATOR,
+    BLOCK,
+    FOREIGN,
+    is_for,
+    MISMATCH,
+    ParameterSpec,
+    PLAIN_NAMES,
+    sections_of,
+    VISCOELASTIC,
+)
 from hmsa.interfaces.topics import NODES
 from hmsa.model.parameters import ActuatorParameters, paper_actuator
 from hmsa.plugins import registered
@@ -392,6 +402,13 @@ def test_unknown_name_is_refused_unless_another_node_has_it(make_ros, name, sugg
         return
     with pytest.raises(BadInputError, match=f'{name} does not exist.* {suggested or ""}'):
         check_names(node)
+
+
+def test_names_of_all_nodes_are_known_without_importing_them():
+    names = {x.name for specs in DECLARED.values() for x in specs}
+    assert {x for x in names if '.' not in x} == PLAIN_NAMES
+    of_blocks = {x.name.partition('.')[0] for x in (*BLOCK, *MISMATCH, *VISCOELASTIC)}
+    assert {x.partition('.')[0] for x in names - PLAIN_NAMES} - of_blocks < FOREIGN
 
 
 @pytest.mark.parametrize(('minimum', 'maximum', 'text'), [

@@ -237,6 +237,12 @@ def test_a_parameter_file_sets_what_a_node_has_above_what_all_have(tmp_path):
     ('/**: {ros__parameters: {half_length: 0.005, actuator.remanence: 0.1}}',
      "'half_length' does not exist: .* such as actuator.half_length"),
     ('actuator: {zeta: 0.1, remanence: 0.1}', "'actuator.zeta' does not exist"),
+    ('planner: {ros__parameters: {flux_max: 0.3, actuator.remanence: 0.1}}',
+     "'flux_max' does not exist: .* such as flux_density_max"),
+    ('/**: {ros__parameters: {joints: [left], left.flux_max: 0.3, actuator.remanence: 0.1}}',
+     "'left.flux_max' does not exist"),
+    ('/**: {ros__parameters: {viscoelstic.ratio: [0.1], actuator.remanence: 0.1}}',
+     "'viscoelstic.ratio' does not exist: .* such as viscoelastic.ratio"),
     ('/**: {ros__parameters: {left.actuator.remanance: 0.1, actuator.remanence: 0.1}}',
      "'left.actuator.remanance' does not exist"),
     ('/**: {ros_parameters: {actuator.remanence: 0.1}}', "no ros__parameters .*'ros_parameters'"),
@@ -253,7 +259,9 @@ def test_names_of_joints_drivers_and_earlier_versions_are_no_wrong_ones(tmp_path
     file = tmp_path / 'it.yaml'
     file.write_text(
         '/**: {ros__parameters: {joints: [actuator], actuator.actuator.remanence: 0.1, law: gent, '
-        'actuator.slew_limit: 1.0, hardware.thermal.probe: 1, identification.noise_std: 0.1}}')
+        'actuator.slew_limit: 1.0, hardware.thermal.probe: 1, identification.noise_std: 0.1, '
+        'third.lead_time: 0.1, use_sim_time: true, start_type_description_service: false, '
+        'qos_overrides./parameter_events.publisher.depth: 100, play.rate: 2.0}}')
     assert read_parameter_file(file)['plant.actuator.actuator.remanence'] == 0.1
 
 

@@ -392,6 +392,29 @@ MISMATCH = tuple(
 #: Fields of `hmsa.model.parameters.ActuatorParameters` that are parameters.
 ACTUATOR_FIELDS = tuple(spec.name.partition('.')[2] for spec in ACTUATOR)
 
+#: Names without a dot of all nodes, so that a wrong one is found without importing any.
+PLAIN_NAMES = frozenset((
+    'after_cut_off', 'allow_partial_joints', 'arrival_tolerance', 'autostart',
+    'coil_time_constant', 'command_delay', 'command_mode', 'command_period', 'command_source',
+    'command_timeout', 'creep_tolerance', 'element', 'feedback', 'feedback_cautious',
+    'feedback_file', 'feedback_frozen', 'feedback_parameters', 'feedback_tolerance',
+    'feedback_trim', 'field', 'flux_density_limit', 'flux_density_max', 'flux_density_min',
+    'frame_id', 'heartbeat_period', 'initial_stretch', 'interlock_required',
+    'interlock_timeout', 'joint', 'joints', 'lateness_limit', 'lateness_tolerance',
+    'lead_time', 'marker_rate', 'marker_scale', 'max_points', 'measurement_delay',
+    'minimax_errors', 'minimax_file', 'path_tolerance', 'publish_clock', 'publish_rate',
+    'publish_scalars', 'rate_noise', 'real_time_factor', 'reorder_time', 'replan_late',
+    'reset_rate', 'reset_stretch', 'robust_order', 'safe_flux', 'safe_ramp_rate', 'seed',
+    'shaper', 'short_spell', 'simultaneous_arrival', 'slew_limit', 'smooth_periods',
+    'start_paused', 'start_time', 'step_count', 'stretch_bias', 'stretch_gain',
+    'stretch_noise', 'stretch_rate_max', 'stretch_tolerance', 'takeover_max_age',
+    'takeover_timeout', 'temperature_limit', 'temperature_max_age', 'topic', 'trajectory_mode',
+    'type', 'vibration_tolerance'))
+#: Parameters of all nodes of ROS, and first parts of names that describe no actuator.
+FOREIGN = frozenset((
+    'use_sim_time', 'start_type_description_service', 'qos_overrides', 'experiment', 'hardware',
+    'identification', 'play', 'record', 'reference', 'sensor', 'storage'))
+
 
 def sections_of(document: Any, name: str = '') -> Iterator[tuple[str, Mapping[str, Any]]]:
     """Yield the full name and the parameters of each section, such as ``/**`` or ``/planner``."""

@@ -163,7 +163,7 @@ def entries_of(path: Path) -> Entries:
     Return the parameters in a file for the nodes of this package.
 
     Sections for other nodes are not used, which is said. Raise `BadInputError` if the file cannot
-    be read, or has a parameter of the actuator that does not exist, which nodes refuse too.
+    be read, or has a parameter that does not exist, which nodes refuse too.
     """
     try:
         document = load_yaml(
@@ -208,19 +208,22 @@ def entries_of(path: Path) -> Entries:
 
 
 def _check_names(path: Path, entries: Entries) -> None:
-    """Raise `BadInputError` for a name of the actuator's parameters that none of them has."""
+    """Raise `BadInputError` for a name that no node has; those for others are not looked at."""
     joints = [x for _, name, value in entries if name == 'joints' and isinstance(value, list)
               for x in value]
+    known = _KNOWN | shared.PLAIN_NAMES
     for _, name, _ in entries:
         first, _, rest = name.partition('.')
-        own = rest if first in joints or first not in _GROUPS and '.' in rest else name
-        group = f'{own.partition(".")[0]}.' if '.' in own else 'actuator.'
-        if own in _KNOWN or 'hardware' in name.split('.')[:2] or not (
-                own in shared.ACTUATOR_FIELDS or '.' in own and group[:-1] in _GROUPS):
+        own = rest if first in joints or first not in _GROUPS and (
+            '.' in rest or rest in known) else name
+        if own in known or own.partition('.')[0] in shared.FOREIGN or first in shared.FOREIGN:
             continue
+        group = f'{own.partition(".")[0]}.' if '.' in own else (
+            'actuator.' * (own in shared.ACTUATOR_FIELDS))
+        near = [x for x in sorted(known) if x.startswith(group)] or known
         raise BadInputError(
             f'{path}: parameter {excerpt(name)} does not exist: expected one of planner and '
-            f'plant, such as {nearest(own, sorted(x for x in _KNOWN if x.startswith(group)))}')
+            f'plant, such as {nearest(own, near)}')
 
 
 def _flat(values: Mapping[Any, object], before: str = '') -> Iterator[tuple[str, object]]:
