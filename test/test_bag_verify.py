@@ -205,6 +205,20 @@ def test_lost_commands_are_named_beside_the_difference(tmp_path):
     assert two.note == ''
 
 
+@pytest.mark.parametrize(('modulus', 'words'), [
+    (10000.0, 'expected differences of that size, from the first sample on'),
+    (8000.0, 'expected at most 0.00011 from that; the rest is from parameters or commands other '
+             'than the real ones')])
+def test_errors_of_the_sensor_are_no_reason_for_larger_differences(
+        tmp_path, capsys, modulus, words):
+    bag = write_joints(tmp_path / 'a', {'one': 1900.0})
+    file = tmp_path / 'it.yaml'
+    file.write_text('/**: {ros__parameters: {stretch_bias: 5.7e-05, '
+                    f'actuator.shear_modulus: {modulus}, actuator.density: 1900.0}}}}')
+    main(['bag', 'verify', str(bag), '--params-file', str(file)])
+    assert f'measured with stretch_bias 5.7e-05: {words}\n' in capsys.readouterr().out
+
+
 def test_every_reader_says_what_is_missing_from_a_damaged_bag(tmp_path, capsys):
     folder = write_joints(tmp_path / 'a', {'one': 900.0}, chunk_size=4_000)
     path = folder / 'a_0.mcap'

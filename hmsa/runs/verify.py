@@ -44,6 +44,8 @@ if TYPE_CHECKING:
 # Distance in time from other samples, in ns, above which samples belong to another run.
 _LARGEST_LEAP = 3600 * NANOSECONDS
 _COMMAND, _FORCE, _TEMPERATURE, _SAMPLE = range(4)
+# Largest error of a sample, in standard deviations of its noise: one in 10^9.
+_SIGMAS = 6.0
 # Minimum distance from rest, in stretch, for branches to have an overstress.
 _AT_REST = 1e-6
 
@@ -141,7 +143,7 @@ def verify_run(run: Run) -> Verification:
     return Verification(
         run.topics.get(JOINT_STATES, str(run.path)), run.topics.get(COMMAND, ''), count,
         len(run.accepted) - refused, late, largest, where / NANOSECONDS,
-        '; '.join([*notes, *_notes(run, left_out, unapplied)]), left_out, unapplied,
+        '; '.join([*notes, *_notes(run, left_out, unapplied, largest)]), left_out, unapplied,
         run.rejected)
 
 
@@ -229,21 +231,27 @@ def _lateness(run: Run) -> tuple[Array, int]:
     return lateness_of(commands, known, last)
 
 
-def _notes(run: Run, left_out: int, unapplied: int) -> Iterator[str]:
+def _notes(run: Run, left_out: int, unapplied: int, largest: float) -> Iterator[str]:
     """Yield reasons for differences between samples and motion, and lost messages."""
     lost = run.lost(COMMAND, APPLIED, FORCE)
     if lost:
         yield (f'the recorder lost messages, {" and ".join(lost)}: expected differences from '
                'there on')
+    # Each with its value for an ideal sensor, and the difference of stretch per unit.
     noise = [
-        f'{name} {value:g}' for name, none in (
-            ('stretch_noise', 0.0), ('rate_noise', 0.0), ('stretch_bias', 0.0),
-            ('stretch_gain', 1.0))
+        (f'{name} {value:g}', abs(value - ideal) * size) for name, ideal, size in (
+            ('stretch_noise', 0.0, _SIGMAS),
+            ('rate_noise', 0.0, _SIGMAS * run.plant.time_unit),
+            ('stretch_bias', 0.0, 1.0), ('stretch_gain', 1.0, float(np.abs(run.stretch).max())))
         if (value := number_of(of_joint(run.parameters, run.joint, f'plant.{name}')))
-        not in (None, none)]
+        not in (None, ideal)]
     if noise:
-        yield (f'the samples are measured with {" and ".join(noise)}: expected differences of '
-               'that size, from the first sample on')
+        # The simulation begins with the error of the first sample.
+        explained = 2.0 * sum(x for _, x in noise)
+        yield (f'the samples are measured with {" and ".join(x for x, _ in noise)}: expected '
+               + ('differences of that size, from the first sample on' if largest <= explained else
+                  f'at most {explained:.2g} from that; the rest is from parameters or commands '
+                  'other than the real ones'))
     if run.rejected:
         yield (f'{run.rejected} commands came later than lateness_limit and were rejected; what '
                'was sent anew is compared')
