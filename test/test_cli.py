@@ -106,6 +106,22 @@ def test_bad_input_is_answered_in_one_line_with_status_2(words, said, capsys):
     assert said in captured.err
 
 
+@pytest.mark.parametrize(('words', 'needed'), [
+    ('plan 1.1:10 --inductance 5mH', '--amplifier'),
+    ('plan 1.1:10 --resistance 2', '--amplifier'),
+    ('plan 1.1:10 --order 3', '--shaper robust or --shaper minimax or --shaper modal'),
+    ('plan 1.1:10 --shaper zv --errors 0.1,0.1,0.1', '--shaper minimax'),
+    ('plan 1.1:10 --periods 2', '--shaper smooth'),
+    ('plan 1.1:10 --max-rate 2', '--shaper smooth'),
+    ('simulate levels.csv --seed 1', '--noise'), ('watch --timeout 1', '--once'),
+    ('report bag --width 85', '--picture'), ('compare a b --data', '--picture'),
+    ('sweep --show residual', '--picture or --out'), ('robustness --seeds 2', '--feedback')])
+def test_an_option_without_the_one_that_it_needs_is_refused(words, needed, capsys):
+    assert main(words.split()) == 2
+    option = [x for x in words.split() if x.startswith('--')][-1]
+    assert capsys.readouterr().err == f'hmsa: error: {option} needs {needed}\n'
+
+
 @pytest.mark.parametrize(('command', 'file'), [
     ('simulate in.csv --until 0.3 --out in.csv', 'in.csv'),
     ('simulate in.csv --until 0.3 --picture in.png --data', 'in.csv'),

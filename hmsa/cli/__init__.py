@@ -17,6 +17,7 @@ import sys
 from typing import Any, NoReturn
 
 from hmsa import __version__
+from hmsa.cli.options import check_needs
 from hmsa.cli.terminal import collecting, show_notes, tolerate, under_way, unshown
 from hmsa.ending import ENDING
 from hmsa.errors import complain, HmsaError
@@ -115,6 +116,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         # A node has its log.
         with collecting(at_once=arguments.is_node), (
                 nullcontext() if arguments.is_node else under_way(arguments.parser.prog)):
+            check_needs(arguments)
             status: int = arguments.run(arguments)
         show_notes()
         print(end='', flush=True)  # also where standard output is closed

@@ -169,17 +169,39 @@ def bags(name: str) -> Row:
     return name, 'BAG', Path, 'folder of a bag, or one of its files', {'nargs': '+'}
 
 
-def add_options(parser: Any, *rows: Row) -> None:
-    """Add arguments in the order of the help."""
+def add_options(parser: Any, *rows: Row, needs: tuple[str, ...] = ()) -> None:
+    """
+    Add arguments in the order of the help.
+
+    Each option may need one of others, as in ``{'needs': ('--shaper robust',)}``, or a group.
+    """
     for names, *texts in rows:
+        settings = dict(texts.pop()) if isinstance(texts[-1], dict) else {}
         if isinstance(texts[0], list):
-            add_options(parser.add_argument_group(names), *texts[0])
-        elif len(texts) == 1:
-            parser.add_argument(names, action='store_true', help=texts[0])
+            add_options(parser.add_argument_group(names), *texts[0], **settings)
+            continue
+        needed = settings.pop('needs', needs)
+        if len(texts) == 1:
+            action = parser.add_argument(names, action='store_true', help=texts[0])
         else:
-            metavar, kind, text, *settings = texts
-            parser.add_argument(
-                *names.split(), metavar=metavar, type=kind, help=text, **dict(*settings))
+            metavar, kind, text = texts
+            action = parser.add_argument(
+                *names.split(), metavar=metavar, type=kind, help=text, **settings)
+        action.needs = needed
+
+
+def check_needs(arguments: argparse.Namespace) -> None:
+    """Raise `BadInputError` for an option that has no effect without another one."""
+    actions = {y: x for x in arguments.parser._actions for y in x.option_strings}
+
+    def given(option: str, value: str = '') -> bool:
+        found = getattr(arguments, actions[option].dest)
+        return found == value if value else found not in (None, False, actions[option].default)
+
+    for option, action in actions.items():
+        needs = getattr(action, 'needs', ())
+        if needs and given(option) and not any(given(*x.split()) for x in needs):
+            raise BadInputError(f'{option} needs {" or ".join(needs)}')
 
 
 def show(

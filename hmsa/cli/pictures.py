@@ -53,7 +53,9 @@ def picture_options(
     files: tuple[Row, ...] = (
         ('--picture', 'FILE', Path, f'{named}; each name ends in {_ENDS}',
          {'nargs': '+', 'default': []}),) if named else ()
-    return *files, ('pictures', rows)
+    # A folder always has figures.
+    needs = ('--picture', *(('--out',) if formats else ())) if named else ()
+    return *files, ('pictures', rows, {'needs': needs})
 
 
 def paper_of(

@@ -69,16 +69,17 @@ def add_parser(subparsers: Any) -> None:
          'order of a shaper (default 2). robust: a cascade of N two-step commands; minimax: as '
          'long as robust; modal: N half periods for a block with modes, and half a period more '
          'for each order above 2 for a beam',
-         {'default': 2}),
+         {'default': 2, 'needs': ('--shaper robust', '--shaper minimax', '--shaper modal')}),
         ('--errors', 'G,C,J', str,
          'relative errors in shear modulus, damping and J_lim that minimax must tolerate (default '
          '0.1,0.1,0.1, or the 95 %% confidence ellipsoid that hmsa identify stored in '
-         '--params-file)'),
+         '--params-file)',
+         {'needs': ('--shaper minimax',)}),
         ('--periods', 'N', float,
          'minimum duration of a smooth move in natural periods (default 1)',
-         {'default': 1.0}),
+         {'default': 1.0, 'needs': ('--shaper smooth',)}),
         ('--max-rate', 'R', float, 'maximum stretch rate of a smooth move (default unlimited)',
-         {'default': math.inf}),
+         {'default': math.inf, 'needs': ('--shaper smooth',)}),
         ('--params-file', 'YAML', Path,
          'parameter file (YAML) of planner and plant, for a plan in seconds and tesla'),
         temperature_option(
@@ -89,8 +90,9 @@ def add_parser(subparsers: Any) -> None:
          'with --params-file: also compare the move times and flux densities of amplifiers from '
          'fast to slow; with --tesla-per-ampere, --inductance and --resistance also current and '
          'voltage'),
-        of_unit('--inductance', 'H', 'inductance L of the coil'),
-        of_unit('--resistance', 'ohm', 'resistance R of the coil'),
+        *((*of_unit(*x), {'needs': ('--amplifier',)}) for x in (
+            ('--inductance', 'H', 'inductance L of the coil'),
+            ('--resistance', 'ohm', 'resistance R of the coil'))),
         ('--out', 'FILE', Path,
          'with --params-file: levels to write, ending in .csv (for hmsa simulate and hmsa run '
          '--levels), .parquet or .mat; an existing file is replaced'),

@@ -31,7 +31,8 @@ def add_parser(subparsers: Any) -> None:
             'sample rate in Hz (default 1000, or 40 samples per period of the actuator)'),
         ('--noise', 'X', float, 'standard deviation of the stretch samples (default 0)',
          {'default': 0.0}),
-        ('--seed', 'N', int, 'seed of the noise (default 0)', {'default': 0}),
+        ('--seed', 'N', int, 'seed of the noise (default 0)',
+         {'default': 0, 'needs': ('--noise',)}),
         ('--out', 'FILE', Path,
          'samples to write, ending in .csv, .parquet or .mat; an existing file is replaced'),
         JSON, *picture_options('pictures to write', panels=True))

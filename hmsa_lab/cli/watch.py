@@ -34,7 +34,8 @@ def add_parser(subparsers: Any) -> None:
         ('--joint', 'NAME', str, 'joint to show, or several separated by commas (default all)',
          {'default': ''}),
         ('--once', 'print one line and exit; status 1 if there is nothing to show'),
-        ('--timeout', 'S', float, 'seconds that --once waits (default 5)', {'default': 5.0}),
+        ('--timeout', 'S', float, 'seconds that --once waits (default 5)',
+         {'default': 5.0, 'needs': ('--once',)}),
         ('--json', 'print one JSON object per line'))
 
 

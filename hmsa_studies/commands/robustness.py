@@ -69,7 +69,7 @@ def add_parser(subparsers: Any) -> None:
          'actuator and coil instead of --zeta, --j-lim and --c1, with any hyperelastic model; '
          'with --feedback a camera samples it (default: a list of blocks and sensors)'),
         ('--seeds', 'N', int, 'runs with different noise for --feedback (default 10)',
-         {'default': 10}),
+         {'default': 10, 'needs': ('--feedback',)}),
         *chunked.options('processes (default 1)'),
         ('--json', 'print JSON in full precision'),
         *picture_options(formats='png,pdf'))

@@ -80,7 +80,8 @@ def add_parser(subparsers: Any) -> None:
          'which keeps the chunks and gets table.parquet at the end (default: CSV on '
          'standard output)'),
         ('--show', 'COLUMN,...', str,
-         'columns to draw (default: duration and first level, or residual and offset)'),
+         'columns to draw (default: duration and first level, or residual and offset)',
+         {'needs': ('--picture', '--out')}),
         *chunked.options(
             'processes; 1 computes in this one (default: one a core for large sweeps)'),
         *picture_options(
