@@ -424,6 +424,12 @@ class Receipts:
         known = self.joints.get(joint)
         return None if known is None else known.clock.offset
 
+    def figures(self) -> dict[str, object]:
+        """Return the values of the clock offset for /diagnostics, if it is known."""
+        return {} if self.offset is None else {
+            'clock_offset_ms': f'{self.offset.ahead / 1e6:.3f}',
+            'clock_offset_error_ms': f'{self.offset.error / 1e6:.3f}'}
+
     @property
     def offset(self) -> Offset | None:
         """Largest clock offset among the devices; None if unknown."""

@@ -653,13 +653,9 @@ class Runtime:
         if clocks and not self._differ:
             self._note(clocks)
         self._differ = bool(clocks)
-        offset = receipts.offset
-        values: dict[str, object] = {} if offset is None else {
-            'clock_offset_ms': f'{offset.ahead / 1e6:.3f}',
-            'clock_offset_error_ms': f'{offset.error / 1e6:.3f}'}
         return severity, message, {
             'sent': self.devices.sent, 'late': late.count, 'replanned': self.deviations.replanned,
             'heartbeats': self.devices.heartbeats,
             'largest_lateness_ms': f'{late.largest / 1e6:.3f}',
             'refused': self.planning.refused, 'clock_jumps': self.clock_jumps,
-            **self.temperatures.figures(), **values}
+            **self.temperatures.figures(), **receipts.figures()}
