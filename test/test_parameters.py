@@ -27,6 +27,7 @@ from hmsa.interfaces.parameters import (
     ParameterSpec,
     PLAIN_NAMES,
     sections_of,
+    SENSOR_LATENCY,
     VISCOELASTIC,
 )
 from hmsa.interfaces.topics import NODES
@@ -390,7 +391,7 @@ def test_list_of_strings_can_be_empty_or_one(make_ros, given, expected):
 @pytest.mark.parametrize(('name', 'suggested'), [
     ('lenght', 'length'), ('left.actuator.remanance', 'left.actuator.remanence'),
     ('third.actuator.density', None), ('shaper', ''), ('play.rate', ''), ('left.shaper', ''),
-    ('qos_overrides.x', '')])
+    ('qos_overrides.x', ''), ('sensor_latency', '')])
 def test_unknown_name_is_refused_unless_another_node_has_it(make_ros, name, suggested):
     node = make_ros(cli_args=[
         '--ros-args', '-p', f'{name}:=1.0', '-p', 'joints:=[left, right]']).node
@@ -406,7 +407,7 @@ def test_unknown_name_is_refused_unless_another_node_has_it(make_ros, name, sugg
 
 def test_names_of_all_nodes_are_known_without_importing_them():
     names = {x.name for specs in DECLARED.values() for x in specs}
-    assert {x for x in names if '.' not in x} == PLAIN_NAMES
+    assert {x for x in names if '.' not in x} == PLAIN_NAMES - {SENSOR_LATENCY}
     of_blocks = {x.name.partition('.')[0] for x in (*BLOCK, *MISMATCH, *VISCOELASTIC)}
     assert {x.partition('.')[0] for x in names - PLAIN_NAMES} - of_blocks < FOREIGN
 

@@ -392,8 +392,11 @@ MISMATCH = tuple(
 #: Fields of `hmsa.model.parameters.ActuatorParameters` that are parameters.
 ACTUATOR_FIELDS = tuple(spec.name.partition('.')[2] for spec in ACTUATOR)
 
+#: What `hmsa identify` writes beside parameters of nodes.
+SENSOR_LATENCY = 'sensor_latency'
 #: Names without a dot of all nodes, so that a wrong one is found without importing any.
 PLAIN_NAMES = frozenset((
+    SENSOR_LATENCY,
     'after_cut_off', 'allow_partial_joints', 'arrival_tolerance', 'autostart',
     'coil_time_constant', 'command_delay', 'command_mode', 'command_period', 'command_source',
     'command_timeout', 'creep_tolerance', 'element', 'feedback', 'feedback_cautious',

@@ -33,6 +33,7 @@ from hmsa.interfaces.parameters import (
     ParameterSpec,
     present_name,
     sections_of,
+    SENSOR_LATENCY,
 )
 from hmsa.plugins import NODES, registered
 
@@ -40,8 +41,8 @@ from hmsa.plugins import NODES, registered
 _LARGEST_FILE = 1 << 20
 # Characters of an unknown name that are reported.
 _LONGEST_NAME = 200
-# Names written by earlier versions of hmsa identify.
-_ONCE = {'identification.verdict', 'identification.noise_std'}
+# Names that hmsa identify writes, or wrote in earlier versions, and no node declares.
+_ONCE = {SENSOR_LATENCY, 'identification.verdict', 'identification.noise_std'}
 _DECLARED: WeakKeyDictionary[Node, dict[str, ParameterSpec]] = WeakKeyDictionary()
 
 
