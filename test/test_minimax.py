@@ -250,5 +250,5 @@ def test_hmsa_plan_takes_errors_from_the_command_line_or_from_an_identification(
     assert levels(**both) not in (levels(), levels(**known))
     for text, message in (
             ('0.1', 'three fractions'), ('a,b,c', "'a,b,c'"), ('2,0,0', '[2.0, 0.0, 0.0]')):
-        assert main(['plan', '1.2:9', '--errors', text]) == 2
+        assert main(['plan', '1.2:9', '--shaper', 'minimax', '--errors', text]) == 2
         assert message in capsys.readouterr().err

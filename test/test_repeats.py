@@ -59,5 +59,6 @@ def test_a_folder_of_repeats_and_a_run_can_be_compared_and_what_is_neither_is_re
     assert ' of 1' in shown
     assert main(['compare', str(folders / 'before'), str(tmp_path)]) == 2
     assert str(tmp_path) in capsys.readouterr().err
-    assert main(['compare', str(folders / 'before'), str(single), '--panels', 'phase']) == 2
+    assert main(['compare', str(folders / 'before'), str(single), '--panels', 'phase',
+                 '--picture', str(tmp_path / 'x.svg')]) == 2
     assert 'leave out --panels' in capsys.readouterr().err
