@@ -299,7 +299,7 @@ def test_policies_grant_exactly_what_a_sensor_does_beside_its_topic(start, ros):
 @pytest.mark.ros
 @pytest.mark.parametrize(('command', 'name', 'enclave'), [
     (('send', '1.1:1', '--timeout', '60'), 'client', 'operator'),
-    (('watch', '--timeout', '60'), 'watch', 'viewer'),
+    (('watch',), 'watch', 'viewer'),
     *(pytest.param(('panel',), x, 'operator', marks=pytest.mark.slow)
       for x in ('client', 'watch'))])
 def test_commands_do_nothing_that_their_enclave_may_not(start, ros, command, name, enclave):
