@@ -11,6 +11,7 @@ from hmsa.judge import _ringing
 from hmsa.judge.fit import fit
 from hmsa.judge.judging import judge
 from hmsa.judge.records import missed, RequestedSetpoint, SensorModel, Tolerances, worst
+from hmsa.judge.stillness import Stillness
 
 MS = 1_000_000
 OMEGA, DECAY = 540.0, 54.0
@@ -297,3 +298,12 @@ def test_a_push_that_does_not_ring_is_neither_arrived_nor_a_vibration():
     found = judge(time, pushed, setpoint())
     assert found.verdict == 'undecided'
     assert 'moves by' in found.message
+
+
+def test_a_joint_does_not_still_rest_where_it_did_before_its_level_changed():
+    still = Stillness()
+    for time in range(100):
+        still.add(time * 1_000_000, 1.4)
+    assert still.rest(lambda _: 600.0, -1) == pytest.approx(1.4)
+    still.add(350_000_000, 0.8)
+    assert still.rest(lambda _: 600.0, 200_000_000) is None

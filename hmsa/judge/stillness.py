@@ -50,6 +50,8 @@ class Stillness:
             self.clear()
         while self._samples and self._samples[0][0] <= since:
             self._samples.popleft()
+            # It rested there before the time.
+            self._rest, self._new = None, len(self._samples)
         if len(self._samples) >= FEWEST and self._new >= _NEW * len(self._samples):
             self._new = 0
             self._rest = self._evaluated(frequency)
