@@ -90,6 +90,29 @@ def test_a_move_does_not_begin_where_a_sensor_in_doubt_shows_the_actuator():
     assert it.planner.plan.levels[0].stretch == pytest.approx(1.4, abs=2e-3)
 
 
+def test_moves_are_those_of_open_loop_once_an_actuator_in_doubt_rang():
+    it = bench(False, 1e-4, factors={'shear_modulus': 1.1}, glances=True, report=False,
+               takeover_timeout=500 * MS)
+    commanded, command, sign = [(it.now, 0.0)], it.plant.command, 1.0
+
+    def amplify(stamp, level):
+        commanded.append((stamp, level))
+        command(stamp, sign * level)
+    it.plant.command = amplify
+    it.effort = lambda: [level for stamp, level in commanded if stamp <= it.now][-1]
+    it.runtime.request(StretchRequest('a', 1.2))
+    it.pass_time(200 * MS)
+    assert it.runtime.follower.joints['a'].adapted()
+    sign = -1.0
+    it.move(1.4, 200 * MS)
+    assert not it.runtime.follower.joints['a'].adapted()
+    sign, rests = 1.0, it.plant.state[0]
+    it.runtime.request(StretchRequest('a', 1.3))
+    it.pass_time(200 * MS)
+    # A move that begins at 1.4, where its levels should have led it, would leave 600 %.
+    assert it.planner.plan.levels[0].stretch == pytest.approx(rests, abs=2e-3)
+
+
 # What is wrong of the plant, of the block, by how many ms timestamps are late, and what is said:
 # what is found, or that samples do not fit.
 NOT_NAMED = pytest.mark.parametrize(('plant', 'factors', 'late', 'word'), [

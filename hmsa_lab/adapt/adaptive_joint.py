@@ -339,8 +339,9 @@ class AdaptiveJoint:
             found = replace(found, trusted=False, trouble=trust.why)
         self.latest, self.news = found, True
         if self.adapts and self.acting is not None:
+            trust.rang = False
             self._take_temperature(self.acting.values[TEMPERATURE], now)
-        elif trust.confirmed is None:
+        elif trust.kept is None:
             self.take_measured(now)
 
     def take_measured(self, now: int) -> None:
@@ -533,9 +534,9 @@ class AdaptiveJoint:
         """Return a model updated by the estimate, or by the last confirmed parameters."""
         if self.acting is not None:
             return learnt_model(model, self.acting, self.planner.plan.levels[-1].stretch)
-        confirmed = self.trust.confirmed
-        return model if confirmed is None else JointModel(
-            confirmed.actuator, replace(model.options, **confirmed.others))
+        kept = self.trust.kept
+        return model if kept is None else JointModel(
+            kept.actuator, replace(model.options, **kept.others))
 
     def may_choose(self, latest: StateEstimate) -> bool:
         """Return whether an estimate may be used to choose the parameters to plan with."""

@@ -32,6 +32,9 @@ _REPORT = 200_000_000
 # Minimum delay of the next update, as a multiple of the time that an update or a correction took:
 # that of one joint, and for each joint, so that all together take less than half of the time.
 _IDLE, _SHARED = 6, 2
+# Vibration, peak to peak, as a fraction of the step, that an actuator shows whatever its sensor:
+# no bias or gain makes one at rest vibrate.
+_RANG = 0.1
 # Largest factor of that delay after updates have kept commands waiting, and its decay with each
 # update.
 _SELDOM, _OFTENER = 32.0, 0.8
@@ -161,7 +164,8 @@ class Feedback(Follower):
         """Return whether plans for a joint do not begin from its newest sample."""
         joint = self.joints.get(name)
         return joint is not None and (
-            joint.doubted or joint.adapted() and joint.state(self._clock()) is not None)
+            joint.doubted and not joint.trust.rang
+            or joint.adapted() and joint.state(self._clock()) is not None)
 
     def sensor(self, name: str) -> SensorModel:
         """Return the sensor of a joint as estimated; as given where there is no estimate."""
@@ -258,6 +262,9 @@ class Feedback(Follower):
     def audit(self, name: str, hold: SetpointSamples) -> None:
         """Audit a setpoint of a joint, once all samples that have arrived are processed."""
         joint = self.joints.get(name)
+        if joint is not None and joint.doubted and hold.found is not None and (
+                hold.found.vibration > _RANG * hold.setpoint.step):
+            joint.trust.rang = joint.news = True
         if joint is not None and joint.adapts and not joint.trust.ended and (
                 hold not in joint.audits):
             joint.audits.append(hold)

@@ -35,6 +35,9 @@ class Trust:
         self.beginnings = 0  # number of restarts
         self.acts = False
         self.why = ''  # why samples are not trusted; empty if they are
+        # Whether the actuator has vibrated since samples do not fit: it or its coil may have
+        # changed, and not its sensor.
+        self.rang = False
         self.ended = False  # whether learnt parameters made moves worse
         self._begin, self._doubts, self._rejected = begin, 0, 0
         # Number of estimates that fitted a move and failed later; number of moves still to fit.
@@ -129,9 +132,14 @@ class Trust:
         self.why, self.ended, self.acts = why, True, False
 
     @property
+    def kept(self) -> JointModel | None:
+        """The parameters that plans use while samples do not fit; None for the given ones."""
+        return None if self.rang else self.confirmed
+
+    @property
     def parameters(self) -> str:
         """The parameters that plans use while samples do not fit, in words."""
-        return 'the parameters given' if self.confirmed is None else (
+        return 'the parameters given' if self.kept is None else (
             'the parameters that samples confirmed last')
 
 
