@@ -13,6 +13,7 @@ from hmsa.motion import subset_inverses, subsets
 from hmsa.planning.planner import Options as PlannerOptions
 from hmsa_lab.adapt.estimator import Estimator, EstimatorOptions
 from hmsa_lab.adapt.hypotheses import Evidence, Hypotheses
+from hmsa_lab.adapt.learnt import sensor_of
 from hmsa_lab.adapt.messages import confounded, sentence
 from hmsa_lab.adapt.motion import follow, Levels
 from hmsa_lab.adapt.prior import Prior
@@ -286,6 +287,13 @@ def test_a_bias_is_known_no_better_than_the_gain_of_the_sensor_lets_tell_it_from
     samples = measured(oracle.BLOCK, extras, noise=1e-4)
     _, found = run(samples, prior=Prior.nominal(oracle.BLOCK, suspects=True))
     assert abs(found.values['stretch_bias']) < 3.0 * found.deviations['stretch_bias']
+
+
+def test_a_bias_at_its_bound_is_correlated_with_nothing():
+    prior = Prior.nominal(oracle.BLOCK, ('stretch_bias', 'stretch_gain'))
+    _, found = run(measured(oracle.BLOCK, oracle.Extras(bias=0.02)), prior=prior)
+    assert sensor_of(found, prior).bias_std == 0.0
+    assert sensor_of(found, prior).together == 0.0
 
 
 def test_another_remanence_leaves_modulus_and_damping_as_given():

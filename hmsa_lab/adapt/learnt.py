@@ -127,7 +127,9 @@ def sensor_of(found: StateEstimate, prior: Prior) -> SensorModel:
     if 'stretch_bias' in known and 'stretch_gain' in known:
         pair = [found.free.index(x) for x in ('stretch_bias', 'stretch_gain')]
         (one, both), (_, two) = found.covariance[np.ix_(pair, pair)]
-        together = float(both / math.sqrt(one * two))
+        # A figure at its bound has no deviation.
+        both_sure = math.sqrt(one * two)
+        together = float(both / both_sure) if both_sure else 0.0
     return SensorModel(**figures, together=together)
 
 
