@@ -64,6 +64,9 @@ _KEPT = 600
 _WARMER = 0.05
 # Fraction by which the report of an applied level may be rounded.
 _ROUNDED = 0.01
+# Natural period, in time scales, of a block of H/L = 1; slower ones need more time to be seen.
+_PERIOD = 2.565
+_LACKS = 'samples show motion that the model lacks, such as another mode'
 
 
 @dataclass(eq=False)
@@ -156,6 +159,13 @@ class AdaptiveJoint:
     def unit(self) -> float:
         """Given time scale in s."""
         return float(self.prior.values['time_unit'])
+
+    @property
+    def _pace(self) -> float:
+        """Given time scale in s, or more for an actuator whose natural period is longer."""
+        given = self.given
+        return self.unit * max(
+            1.0, 2.0 * math.pi / given.frequency(given.actuator.rest) / _PERIOD)
 
     @property
     def adapts(self) -> bool:
@@ -317,26 +327,31 @@ class AdaptiveJoint:
             return
         if found is not None and found.poor and trust.acts:
             trouble = trouble or 'samples fit worse than their noise'
+        lacks = found is not None and found.coherent and not trouble
+        if lacks and trust.acts:
+            trust.wait(now)
         self._anew &= found is None
         acted = trust.acts
         if trust.doubt(
                 trouble, now, used=not self.sensor_changed, fitted=self._fitted > 0
-        ) if trouble else found is not None and trust.fits(
-                plan, self.unit, estimator, now, waits=now < self.waits):
+        ) if trouble else found is not None and not lacks and trust.fits(
+                plan, self._pace, estimator, now, waits=now < self.waits):
             if acted:
                 self._tried.clear()
-            # Samples that an estimate in use has fitted do not show what has changed since.
-            self._restart(found.jump if found is not None and jumped else max(
-                estimator.since, self._fitted if acted else 0))
+            # Samples that an estimate in use has fitted do not show what has changed since. Until
+            # a move confirms one, a mode that the model lacks looks like a sensor that changes.
+            self._restart(self._since if trust.confirmed is None else (
+                found.jump if found is not None and jumped else max(
+                    estimator.since, self._fitted if acted else 0)))
         elif found is not None and trust.acts and trust.failed and (
                 self._look_at_sensor(found, now, anew=not acted)):
             found = None
-        if not trouble:
+        if not (trouble or lacks):
             self._fitted = max(self._fitted, estimator.newest)
         if found is not None and not trust.why:
             self._look_at_vibration(plan, found)
-        if found is not None and trust.why:
-            found = replace(found, trusted=False, trouble=trust.why)
+        if found is not None and (trust.why or lacks):
+            found = replace(found, trusted=False, trouble=trust.why or _LACKS)
         self.latest, self.news = found, True
         if self.adapts and self.acting is not None:
             trust.rang = False
@@ -577,7 +592,8 @@ class AdaptiveJoint:
     def words(self, now: int) -> str:
         """Return the problem at a time, in a sentence without full stop."""
         trust = self.trust
-        why = trust.why or self.estimator.screening.trouble
+        why = trust.why or self.estimator.screening.trouble or (
+            '' if self.latest is None else self.latest.trouble)
         if trust.ended:
             return (f'{why}: feedback has ended, open loop with {trust.parameters}; '
                     '~/reset_estimate restarts it')

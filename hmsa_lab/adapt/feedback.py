@@ -250,7 +250,8 @@ class Feedback(Follower):
     def _report(self, joint: AdaptiveJoint, now: int) -> None:
         found, mode = joint.latest, self._settings.feedback
         bad = joint.trust.why or joint.sensor_changed or (
-            found is not None and mode == 'observe' and differences(found, joint.prior.values))
+            found is not None and (found.trouble or mode == 'observe' and differences(
+                found, joint.prior.values)))
         self._outputs.append(EstimateChanged(
             now, joint.name, Severity.WARN if bad else Severity.OK, joint.words(now),
             {'mode': mode, **joint.figures(),

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hmsa.identification.fit import loss, weights_of
+from hmsa.identification.fit import loss, robust_scale, weights_of
 from hmsa.identification.quantities import complete, quantity_of, TEMPERATURE, values_at
 from hmsa.identification.response import gain_of, sensed
 from hmsa.model.equations import Array
@@ -31,6 +31,11 @@ _MORE = 1.3
 # Mean negative log probability of a sample above which a fit is poor, its usual value, and the
 # number of standard deviations by which it surely differs from that.
 _POOR, _USUAL, _SURELY = 1.0, 0.5, 5.0
+# Time scales from the beginning of a window, and samples in them, in which residuals are compared
+# with their successors; correlation from which they are no noise, if it surely differs from 0;
+# and their size as a fraction of the motion: a mode with 7 % of the step leaves 0.01, creep and
+# lag 7e-4 until they are known.
+_EARLY, _FEWEST, _FOLLOWS, _MATTERS = 8.0, 20, 0.3, 0.004
 # Standard deviations of a jump of bias and gain of the sensor, and its prior improbability as a
 # logarithm.
 _JUMPS, _RARELY = np.array([0.05, 0.1]), 3.0
@@ -91,6 +96,7 @@ class Solution:
     # against that.
     changed: float = -math.inf
     poor: bool = False  # whether the samples fit worse than their noise
+    coherent: bool = False  # whether they leave more than noise
 
     @property
     def without_samples(self) -> 'Solution':
@@ -224,7 +230,8 @@ class Window:
         found = descend(z, here) or descend(self._at_ease(self.mean))
         if found is None:
             return None
-        if len(self.time) >= _MORE * self.weighed or self._is_poor(found, noise):
+        if (len(self.time) >= _MORE * self.weighed or self._is_poor(found, noise)
+                or self._is_coherent(found)):
             found = self._look(found, descend)
             if self._is_poor(found, noise):
                 # There may be another local optimum.
@@ -246,7 +253,7 @@ class Window:
         return Solution(
             found.z, found.here, sure * inverse(found.matrix, found.loose) + square,
             np.broadcast_to(off, z.shape), np.broadcast_to(instead, z.shape), doubt, self.jumped,
-            self.jump, self.changed, poor)
+            self.jump, self.changed, poor, self._is_coherent(found))
 
     def _doubt(self, found: Optimum) -> BiasCase:
         """Return the expectation if a constant force and a gain may be in error, too."""
@@ -313,6 +320,18 @@ class Window:
                         - 0.5 * float(off @ more @ off) + float(log_density))
         return (max(odds[0], odds[2]) - odds[1]) / float(
             self.before.log_density[0] - self.before.log_density[1])
+
+    def _is_coherent(self, found: Optimum) -> bool:
+        """Return whether residuals follow each other, as of motion that the model lacks."""
+        early = self.time < self.begin + _EARLY * found.here.values['time_unit']
+        left = found.here.residual[early]
+        if len(left) < _FEWEST:
+            return False
+        most = 3.0 * robust_scale(left)
+        left = np.minimum(np.maximum(left, -most), most)
+        common, square = float(left[:-1] @ left[1:]), float(left @ left)
+        return common > square * max(_FOLLOWS, _SURELY / math.sqrt(len(left))) and (
+            common > len(left) * (_MATTERS * float(np.ptp(self.stretch))) ** 2)
 
     def _is_poor(self, found: Optimum, noise: float, more: float = 0.0) -> bool:
         """
