@@ -56,7 +56,8 @@ class Trust:
             return False
         self.why = why
         self._doubts += 1
-        if self.acts and self._doubts < _PERSISTENT and not at_once:
+        # The first samples of a motion, which are few, may not fit yet.
+        if (self.acts or not self.beginnings) and self._doubts < _PERSISTENT and not at_once:
             return False
         self._failures = max(self._failures + (self.acts and used), fitted)
         self.beginnings += 1
