@@ -231,8 +231,8 @@ def test_once_waits_for_what_is_missing_and_says_so(start, ros_domain_id):
 
 
 @pytest.mark.parametrize(('words', 'said'), [
-    (['--timeout', '-1'], 'timeout is -1 s: expected 0 to'),
-    (['--timeout', 'nan'], 'timeout is nan'),
+    (['--once', '--timeout', '-1'], 'timeout is -1 s: expected 0 to'),
+    (['--once', '--timeout', 'nan'], 'timeout is nan'),
     (['--namespace', '9 bad'], "namespace '9 bad'"),
 ])
 def test_bad_input_is_answered_in_one_line_with_status_2(words, said, capsys, ros_env):
