@@ -114,23 +114,6 @@ def _decoded(content: bytes) -> str:
         return content.decode('cp1252')
 
 
-def read_lines(
-        path: Path, kind: str) -> tuple[list[tuple[int, str]], str | None, list[str]]:
-    """
-    Return number and text of each line of a CSV, its separator, and the cells of the header.
-
-    Raise `BadInputError` if it cannot be read as the expected ``kind``, or is empty.
-    """
-    rows, separator = _rows(_text(path, kind))
-    if not rows:
-        raise BadInputError(f'{path} is empty: expected a header and rows of numbers')
-    head = rows[0][1]
-    if '\0' in head:
-        raise BadInputError(f'{path} has zero bytes in its header: expected {kind} in UTF-8')
-    separator = separator or next((x for x in _SEPARATORS if x in head), None)
-    return rows, separator, split(head, separator)
-
-
 def read_table(
         path: Path, wanted: tuple[str, ...], *, kind: str = 'a CSV',
         rest_length: float | None = None, notes: list[str] | None = None) -> CsvColumns:
@@ -166,11 +149,18 @@ def read_table(
         If the file cannot be read or has no header, or if a column is missing or one of several.
 
     """
-    rows, separator, cells = read_lines(path, kind)
-    if all(number(x, separator) is not None for x in cells):
+    rows, separator = _rows(_text(path, kind))
+    if not rows:
+        raise BadInputError(f'{path} is empty: expected a header and rows of numbers')
+    head = rows[0][1]
+    if '\0' in head:
+        raise BadInputError(f'{path} has zero bytes in its header: expected {kind} in UTF-8')
+    separator = separator or next((x for x in _SEPARATORS if x in head), None)
+    cells = _split(head, separator)
+    if all(_number(x, separator) is not None for x in cells):
         raise BadInputError(
-            f'{path} begins with numbers ({excerpt(rows[0][1])}): expected a header with the '
-            f'columns {", ".join(wanted)} in line {rows[0][0]}')
+            f'{path} begins with numbers ({excerpt(head)}): expected a header with the columns '
+            f'{", ".join(wanted)} in line {rows[0][0]}')
     other = _ALIASES if rest_length is None else {**_ALIASES, 'length': 'stretch'}
     places = _places(path, cells, wanted, other)
     missing = [x for x in wanted if x not in places]
@@ -185,7 +175,7 @@ def read_table(
     columns: dict[str, Array] = {
         name: np.full(len(rows) - 1 - bool(below), np.nan) for name in wanted}
     for i, (line, text) in enumerate(rows[1 + bool(below):]):
-        parts = split(text, separator)
+        parts = _split(text, separator)
         if any(parts[len(cells):]):
             raise BadInputError(
                 f'{path} line {line} has {len(parts)} cells in {len(cells)} columns '
@@ -193,7 +183,7 @@ def read_table(
         for name, place in places.items():
             if place.index >= len(parts):
                 continue
-            value = number(parts[place.index], separator)
+            value = _number(parts[place.index], separator)
             if value is None:
                 raise BadInputError(
                     f'{path} line {line} has {excerpt(parts[place.index])} in column {name}: '
@@ -226,8 +216,7 @@ def _decimal_commas(separator: str | None) -> str:
             if separator == ',' else '')
 
 
-def split(text: str, separator: str | None) -> list[str]:
-    """Return the cells of a line; without a separator, its words."""
+def _split(text: str, separator: str | None) -> list[str]:
     if separator is None:
         return text.split()
     try:
@@ -236,7 +225,7 @@ def split(text: str, separator: str | None) -> list[str]:
         return [text]
 
 
-def number(text: str, separator: str | None) -> float | None:
+def _number(text: str, separator: str | None) -> float | None:
     """Return the number in a cell, NaN for a missing value, None for other text."""
     try:
         return float(text)
@@ -295,7 +284,7 @@ def _units_below(
     if len(rows) < 2:
         return {}
     parts = [x.strip('[]() ').lower().replace('\u03bc', 'µ')
-             for x in split(rows[1][1], separator)]
+             for x in _split(rows[1][1], separator)]
     units = {name: parts[x.index] for name, x in places.items() if x.index < len(parts)}
     if not any(x not in _DIMENSIONLESS and x in {**_UNITS[name], **_LENGTHS}
                for name, x in units.items()):

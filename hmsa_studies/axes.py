@@ -12,23 +12,21 @@ few values are curves or rows of panels; samples become quantiles.
 """
 
 from collections.abc import Collection, Mapping, Sequence
+import csv
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import product
 import math
 from pathlib import Path
-import re
 import sys
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hmsa.columns import number, read_lines, split
 from hmsa.errors import BadInputError, check_number
 from hmsa.interfaces.actuator import completed, model_from
 from hmsa.interfaces.parameters import LAW, LAW_NAME, ParameterSpec, PLANNED
-from hmsa.interfaces.quantities import quantity_of
 from hmsa.model.delivery import Delivery
 from hmsa.model.equations import Array
 from hmsa.model.laws import LAWS
@@ -53,9 +51,6 @@ _POSITIVE = (math.ulp(0.0), FINITE)
 _MODULUS = 'actuator.shear_modulus'
 #: Prefix of the columns of the actuator, instead of that of a block's parameters.
 ACTUAL, BLOCK_OF = 'actual.', 'actuator.'
-# Units of columns in SI, and a header of a table of cases: a name, and its unit if it has one.
-_SI = {x.name: x.unit for x in PLANNED} | {'command_period': 's'}
-_HEADER = re.compile(r'([^\s\[(/]+)\s*(?:[\[(/]\s*([^\])]*?)\s*[\])]?)?')
 #: Maximum number of values of a column, or of cases, since they are kept in memory.
 MOST_VALUES = 10_000_000
 
@@ -283,46 +278,50 @@ def _part(part: str, text: str, column: str) -> Array:
 
 
 def read_cases(path: Path, columns: Collection[str]) -> dict[str, Array]:
-    """
-    Read a CSV file with some of the columns, in SI.
-
-    A unit may follow a name, as in ``flux_density_max [mT]``. Raise `BadInputError` for any other.
-    """
+    """Read a CSV file with some of the columns, or raise `BadInputError`."""
     expected = ', '.join(columns)
-    lines, separator, cells = read_lines(path, f'a CSV of cases with some of {expected}')
-    names, factors = [], []
-    for cell in cells:
-        found = _HEADER.fullmatch(cell)
-        name, unit = (cell, None) if found is None else found.groups()
-        if name not in columns:
-            raise BadInputError(f'{path} has a column {name!r}: expected some of {expected}')
-        if name in names:
-            raise BadInputError(f'{path} has two columns {name!r}: expected one')
-        names.append(name)
-        own = name if name in _SI else BLOCK_OF + name.removeprefix(ACTUAL)
-        factors.append(quantity_of(f'1{unit or ""}', _SI.get(own, ''), f'{path}: column {name}'))
-    if len(lines) - 1 > MOST_VALUES:
+    rows: list[list[float]] = []
+    try:
+        with path.open(newline='', encoding='utf-8-sig') as file:
+            reader = csv.reader(file, strict=True)
+            names = [name.strip() for name in next(reader, [])]
+            if not names:
+                raise BadInputError(
+                    f'{path} is empty: expected a header with some of {expected}, and cases')
+            for name in names:
+                if name not in columns:
+                    raise BadInputError(
+                        f'{path} has a column {name!r}: expected some of {expected}')
+                if names.count(name) > 1:
+                    raise BadInputError(f'{path} has two columns {name!r}: expected one')
+            for cells in reader:
+                if cells:
+                    rows.append(_case(cells, names, f'{path}, line {reader.line_num}'))
+                if len(rows) > MOST_VALUES:
+                    raise BadInputError(
+                        f'{path} has more than {MOST_VALUES:,} cases: expected at most that '
+                        'many; split it')
+    except OSError as error:
         raise BadInputError(
-            f'{path} has more than {MOST_VALUES:,} cases: expected at most that many; split it')
-    if len(lines) == 1:
+            f'cannot read {path}: {error.strerror or error}; expected a CSV file of cases'
+        ) from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise BadInputError(f'{path} is no CSV file in UTF-8: {error}') from error
+    if not rows:
         raise BadInputError(f'{path} has a header only: expected at least one case')
-    rows = [_case(split(text, separator), names, separator, f'{path}, line {line}')
-            for line, text in lines[1:]]
-    return dict(zip(names, np.array(rows).T * np.array(factors)[:, None], strict=True))
+    return dict(zip(names, np.array(rows).T, strict=True))
 
 
-def _case(
-        cells: Sequence[str], names: Sequence[str], separator: str | None,
-        where: str) -> list[float]:
+def _case(cells: Sequence[str], names: Sequence[str], where: str) -> list[float]:
     """Parse a row of a table of cases."""
     if len(cells) != len(names):
         raise BadInputError(f'{where}: {len(cells)} cells, expected {len(names)}')
     values = []
     for name, cell in zip(names, cells, strict=True):
-        value = number(cell, separator)
-        if value is None or math.isnan(value):
-            raise BadInputError(f'{where}: {name} is {cell!r}, expected a number')
-        values.append(value)
+        try:
+            values.append(float(cell))
+        except ValueError:
+            raise BadInputError(f'{where}: {name} is {cell!r}, expected a number') from None
     return values
 
 

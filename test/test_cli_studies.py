@@ -299,8 +299,8 @@ def test_sweep_says_how_to_get_parquet_where_it_is_missing(refused, tmp_path, mo
 @pytest.mark.parametrize(('words', 'message'), [
     (['--zeta', '0:2'], "zeta is '0:2'"),
     (['--target', '0'], 'greater than 0'),
-    (['--cases', 'none.csv'], 'none.csv cannot be read (No such file'),
-    (['--cases', '.'], '. cannot be read (Is a directory'),
+    (['--cases', 'none.csv'], 'cannot read none.csv: No such file'),
+    (['--cases', '.'], 'cannot read .: Is a directory'),
     (['--out', 'o.txt'], '.csv or .parquet'),
     (['--out', 'none/o.csv'], 'cannot write none/o.csv: none is no folder'),
     (['--out', 'none/o.parquet'], 'none/o.parquet'),
@@ -311,20 +311,6 @@ def test_sweep_refuses_bad_input_in_one_line(refused, tmp_path, words, message):
         needs('pyarrow')
     assert message in refused('sweep', *words)
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize('text', [
-    'target;flux_density_max [mT]\n1,1;200\n1,2;300\n',
-    '\ufefftarget\tflux_density_max (T)\n1.1\t0.2\n1.2\t0.3\n',
-    '# both\ntarget,flux_density_max\n1.1,0.2\n1.2,0.3\n'])
-def test_sweep_reads_cases_as_other_tables_are_read(run, tmp_path, text):
-    (tmp_path / 'cases.csv').write_text(text)
-    (tmp_path / 'it.yaml').write_text('actuator: {density: 1900.0}')
-    status, out, _ = run('sweep', '--cases', 'cases.csv', '--params-file', 'it.yaml')
-    assert status == 0
-    rows = [x.split(',') for x in out.splitlines()]
-    places = [rows[0].index(x) for x in ('target', 'flux_density_max')]
-    assert [[float(x[i]) for i in places] for x in rows[1:]] == [[1.1, 0.2], [1.2, 0.3]]
 
 
 def test_sweep_refuses_a_grid_of_a_column_of_the_cases_and_a_folder_as_file(refused, tmp_path):
