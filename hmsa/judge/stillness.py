@@ -39,6 +39,7 @@ class Stillness:
         self._samples.clear()
         self._new = 0  # number of samples since the last evaluation
         self._rest: float | None = None
+        self._until = 0  # timestamp of the newest sample evaluated
 
     def rest(self, frequency: Callable[[float], float], since: int) -> float | None:
         """
@@ -50,10 +51,12 @@ class Stillness:
             self.clear()
         while self._samples and self._samples[0][0] <= since:
             self._samples.popleft()
-            # It rested there before the time.
-            self._rest, self._new = None, len(self._samples)
+        if self._rest is not None and self._until <= since and self._samples and (
+                abs(self._samples[-1][1] - self._rest) > _REST):
+            # It rested there before the time, and is elsewhere now.
+            self._rest = None
         if len(self._samples) >= FEWEST and self._new >= _NEW * len(self._samples):
-            self._new = 0
+            self._new, self._until = 0, self._samples[-1][0]
             self._rest = self._evaluated(frequency)
         return self._rest
 
