@@ -27,7 +27,7 @@ from hmsa.planning.planner import Options, Planner
 from hmsa.report.comparison import Part
 from hmsa.report.evaluation import findings_of, MoveResult
 from hmsa.runs.bags import read_runs
-from hmsa.runs.record import Run, without_repeats
+from hmsa.runs.record import without_repeats
 from hmsa_ros.clients.experiment import conduct, Experiment
 from hmsa_ros.clients.processes import NodeProcess
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
@@ -170,40 +170,39 @@ def run_demo(folder: Path, progress: Callable[[str, float], None]) -> DemoResult
     """Run the sequence of the paper in a prepared folder, and evaluate the bag."""
     experiment = Experiment(folder, [
         ((stretch,), span * paper_actuator().time_unit) for stretch, span in SEQUENCE], _NODES)
-    exits = conduct(experiment, progress).exits
-    for attempt in range(1, _ATTEMPTS):
-        if not (missing := _missing(*read_runs(experiment.bag))):
+    for attempt in range(1, _ATTEMPTS + 1):
+        exits = conduct(experiment, progress).exits
+        progress('evaluating the bag', 1.0)
+        run, = read_runs(experiment.bag)
+        part = Part.of(run)
+        if not (missing := _missing(part)):
             break
+        if attempt == _ATTEMPTS:
+            raise HmsaError(f'{missing}; if the machine is busy and commands come late, try again')
         kept = experiment.bag.rename(folder / f'late_{attempt}')
         assume(f'{missing}; commands come late on a busy machine, so that the sequence runs again '
                f'(bag kept in {kept})', UnusualWarning)
-        exits = conduct(experiment, progress).exits
-    progress('evaluating the bag', 1.0)
     picture, second = folder / 'run.png', folder / 'adapting.png'
-    results = _evaluate(experiment.bag, picture)
+    results = _evaluate(part, picture)
     progress('a plant that is not as planned', 1.0)
     return DemoResult(results, exits, experiment.bag, picture, second_act(second), second)
 
 
-def _missing(run: Run) -> str:
+def _missing(part: Part) -> str:
     """Return what was not carried out; empty if everything was."""
-    count, levels = len(Part.of(run).evaluation.results), len(without_repeats(run.commands)[0])
+    count, levels = len(part.evaluation.results), len(without_repeats(part.run.commands)[0])
     if (count, levels) == (len(SEQUENCE), 2 * len(SEQUENCE)):
         return ''
     return (f'{count} of {len(SEQUENCE)} setpoints were carried out, with {levels} commands: '
             f'expected all, with {2 * len(SEQUENCE)}')
 
 
-def _evaluate(bag: Path, picture: Path) -> tuple[SetpointResult, ...]:
-    """Read the run from the bag, evaluate and plot it."""
+def _evaluate(part: Part, picture: Path) -> tuple[SetpointResult, ...]:
+    """Evaluate the run and plot it."""
     from hmsa.report.looks import SCREEN
     from hmsa.report.picture import draw
 
-    run, = read_runs(bag)
-    if missing := _missing(run):
-        raise HmsaError(f'{missing}; if the machine is busy and commands come late, try again')
-    part = Part.of(run)
-    found = findings_of(run, Tolerances(LARGEST_RESIDUAL, LARGEST_RESIDUAL, 0.0))
+    found = findings_of(part.run, Tolerances(LARGEST_RESIDUAL, LARGEST_RESIDUAL, 0.0))
     results = tuple(
         SetpointResult(**asdict(x), finding=found[x.place].to_dict())
         for x in part.evaluation.results)
