@@ -72,8 +72,8 @@ _OF_BEAMS = 2.5
 # Relative change of the force by J_lim that is noticeable.
 _STIFFENS = 0.04
 # Lines in place of other parameters, and the fraction of what these explain below which modes are
-# no rival: they
-# explain all of it in 50 simulations with modes, and 0.65 in one with a lag, creep and a force.
+# no rival: they explain all of it in 50 simulations with modes, and 0.65 in one with a lag, creep
+# and a force.
 _LINES, _NEARLY = 2, 0.8
 #: Fraction of the residuals' sum of squares that all modes together explain at least, and their
 #: dampings beside those of a viscous material.
