@@ -1228,9 +1228,7 @@ def test_of_many_arrivals_the_worst_are_shown_and_the_table_has_all(tmp_path):
 def test_the_command_writes_page_and_pictures_and_names_them(bag, tmp_path, capsys):
     names = [tmp_path / x for x in ('run.html', 'run.png', 'run.pdf')]
     out, png, pdf = map(str, names)
-    words = [
-        'report', str(bag), '--out', out, '--dpi', '50', '--panels', 'command,response',
-        '--picture']
+    words = ['report', str(bag), '--out', out, '--dpi', '50', '--picture']
     assert main([*words, png, pdf, '--data']) == 0
     assert capsys.readouterr().out.split() == [out, png, pdf, str(tmp_path / 'run.csv')]
     assert names[0].read_text(encoding='utf-8').startswith('<!DOCTYPE html>')
