@@ -214,8 +214,10 @@ def _adapted(joints: int, domain: int, folder: Path, targets: Sequence[float]) -
     errors = []
     for k, (before, target) in enumerate(pairwise((1.0, *targets))):
         rests = (time > begin + (k + _READ[0]) * _HOLD) & (time < begin + (k + _READ[1]) * _HOLD)
+        # A sequence that was dropped has no samples there.
         errors.append(100.0 * np.abs(
-            np.mean(stretch[rests], axis=0) - target) / abs(target - before))
+            np.mean(stretch[rests], axis=0) - target) / abs(target - before)
+            if rests.any() else np.full(joints, np.nan))
     return {'joints': joints, **seen, 'errors': np.array(errors).T.tolist()}
 
 
@@ -233,7 +235,8 @@ def adapting(*, quick: bool) -> Sheet:
         rows.append([
             f'{x["joints"]:g} joints', f'{100.0 * x["planner_cores"]:.0f} %',
             f'{100.0 * x["estimating_cores"]:.0f} %', *(
-                f'{np.median(y):.2f} ({np.max(y):.2f})' if np.size(y) else '-'
+                f'{np.median(y):.2f} ({np.max(y):.2f})'
+                if np.size(y) and np.all(np.isfinite(y)) else '-'
                 for y in (first, second, later)), f'{x["late"]:g}'])
     return Sheet(
         'adapting', 'Feedback: every G is 20 % higher than planned, samples at 1 kHz; how far '

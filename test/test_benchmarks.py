@@ -84,7 +84,8 @@ def test_tables_of_a_page_are_renewed_and_nothing_else():
 
 
 @pytest.mark.parametrize('name', [
-    'machine', 'planner', 'plant', 'start', 'choices', 'recorder', 'player', 'crash', 'joints'])
+    'machine', 'planner', 'plant', 'start', 'choices', 'recorder', 'player', 'crash', 'joints',
+    'adapting'])
 def test_page_on_speed_has_marks_for_each_table(name):
     page = (contenders.HERE.parent / 'docs' / 'validation' / 'speed.md').read_text(
         encoding='utf-8')
