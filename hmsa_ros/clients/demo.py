@@ -167,7 +167,15 @@ class DemoResult:
 
 
 def run_demo(folder: Path, progress: Callable[[str, float], None]) -> DemoResult:
-    """Run the sequence of the paper in a prepared folder, and evaluate the bag."""
+    """
+    Run the sequence of the paper in a prepared folder, and evaluate the bag.
+
+    Raises
+    ------
+    HmsaError
+        If a node fails, or the sequence is not carried out in any of the attempts.
+
+    """
     experiment = Experiment(folder, [
         ((stretch,), span * paper_actuator().time_unit) for stretch, span in SEQUENCE], _NODES)
     for attempt in range(1, _ATTEMPTS + 1):
