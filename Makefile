@@ -42,11 +42,15 @@ demo: env ## run the demonstration
 	$(BIN)/hmsa demo $(ARGS)
 
 .PHONY: test
-test: tools ## run all tests but the slow ones, in parallel
-	$(PYTEST) -m 'not slow and not lint' $(ARGS)
+test: tools ## run the tests, in parallel
+	$(PYTEST) -m 'not thorough and not slow and not lint' $(ARGS)
+
+.PHONY: thorough
+thorough: tools ## run the tests of feedback, identification and modes that compute for long
+	$(PYTEST) -m 'thorough and not slow' $(ARGS)
 
 .PHONY: full
-full: tools ## run the slow tests too, and random examples, as before a release
+full: tools ## run thorough and slow tests too, and random examples, as before a release
 	$(PYTEST) -m 'not lint' --hypothesis-profile full $(ARGS)
 	$(MAKE) actions
 
@@ -56,7 +60,7 @@ actions: $(VENV)/.control_msgs tools ## build control_msgs, and test the action 
 
 .PHONY: check
 check: tools ## run the tests that need no nodes
-	$(PYTEST) -m 'not slow and not lint and not ros' $(ARGS)
+	$(PYTEST) -m 'not thorough and not slow and not lint and not ros' $(ARGS)
 
 .PHONY: lint
 lint: $(VENV)/.lint env ## check style and types: ruff, mypy and rules of this project

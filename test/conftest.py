@@ -183,7 +183,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         place = {x: i / len(with_nodes) for i, x in enumerate(with_nodes)} | {
             x: 0.9 * i / len(modules) for i, x in enumerate(modules)}
         items.sort(key=lambda item: (
-            not any(item.get_closest_marker(x) for x in ('long', 'slow')),
+            not any(item.get_closest_marker(x) for x in ('long', 'slow', 'thorough')),
             place.get(item, place.get(item.path, 0.0))))
 
 

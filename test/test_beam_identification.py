@@ -34,6 +34,8 @@ from hmsa.model.laws.coordinate import DEFLECTION
 from hmsa.model.modes import Modes
 from hmsa.model.simulation import ActuatorSimulation
 
+pytestmark = pytest.mark.thorough
+
 BEAM = silicone()
 PERIOD = 2.0 * np.pi * BEAM.time_unit / float(
     equations.natural_frequency(0.0, BEAM.nondimensional))

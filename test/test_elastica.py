@@ -25,6 +25,8 @@ from hmsa.model.status import Code
 from hmsa.planning.shapers import get_shaper
 from hmsa.planning.shapers.request import MoveRequest
 
+pytestmark = pytest.mark.thorough
+
 STRIP = silicone(**{'law.shape': 'elastica'})
 # Time scale of the rod in that of the strip, whose first frequency is sqrt(3).
 UNIT = FIRST / math.sqrt(3.0)

@@ -18,6 +18,8 @@ from hmsa_lab.adapt.messages import confounded, sentence
 from hmsa_lab.adapt.motion import follow, Levels
 from hmsa_lab.adapt.prior import Prior
 
+pytestmark = pytest.mark.thorough
+
 # Rest without field, a push, rest near 1.4, and back to rest near 1.1; in s and T.
 TIMES = np.array([0.0, 0.03, 0.036, 0.09])
 LEVELS = np.array([0.0, 0.06, oracle.level_of(1.4), oracle.level_of(1.1)])

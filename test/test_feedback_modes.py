@@ -9,6 +9,8 @@ from hmsa import Actuator
 from hmsa.model.modes import Modes
 from hmsa.model.simulation import ActuatorSimulation
 
+pytestmark = pytest.mark.thorough
+
 # H/L, damping ratio, noise, samples in a time scale, factor of the mass, and frequency ratio,
 # share and damping ratio of the second mode; targets; half length in m; whether the planner's
 # model has the mass; how feedback is; seed of the noise.

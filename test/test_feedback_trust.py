@@ -14,7 +14,7 @@ from hmsa_lab.adapt import adaptive_joint, corrections, estimator, window
 from hmsa_lab.adapt.motion import follow
 from hmsa_ros.runtime.records import Severity, StretchRequest, Trajectory
 
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.thorough
 
 MOVES = (1.4, 1.1, 1.4, 1.1, 1.4)
 

@@ -15,6 +15,8 @@ from hmsa.identification.measurement import Measurement
 from hmsa.identification.quantities import check_free, Known
 from hmsa.interfaces.actuator import actuator_from, parameters_of
 
+pytestmark = pytest.mark.thorough
+
 NOISE = 1e-3
 REST = ('damping_coefficient', 'remanence', 'stretch_bias')
 #: True constants by name, as the oracle takes them, and where a search begins.

@@ -33,6 +33,8 @@ from hmsa.model.parameters import paper_actuator
 from hmsa.model.simulation import ActuatorSimulation
 from hmsa.planning.two_step import plan_two_step
 
+pytestmark = pytest.mark.thorough
+
 BLOCK = replace(paper_actuator(), damping_coefficient=0.5)
 TRUE = replace(
     BLOCK, mass_factor=1.2, remanence=0.11, modes=Modes((1.4, 2.6), (0.2, 0.06), (0.1, 0.15)))

@@ -16,6 +16,8 @@ from hmsa.model.modes import Modes
 from hmsa.model.parameters import paper_actuator
 from hmsa.model.simulation import simulate
 
+pytestmark = pytest.mark.thorough
+
 NOMINAL = slow(paper_actuator())
 HOLD = 1.2
 SETPOINTS = ((1.15, HOLD), (1.3, HOLD), (1.05, HOLD))

@@ -31,6 +31,8 @@ from hmsa.planning.shapers.minimax import (
 from hmsa.planning.shapers.request import MoveRequest
 from hmsa.planning.timeline import JointModel, Options
 
+pytestmark = pytest.mark.thorough
+
 PAPER = NondimensionalParameters()
 WIDE = Limits(-20.0, 20.0)
 TURN = np.exp(2j * np.pi * np.arange(96) / 96)

@@ -33,7 +33,7 @@ from hmsa_ros.runtime.records import (
     Trajectory,
 )
 
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.thorough
 
 COEFFICIENTS = {'shear_modulus': 3e-3, 'remanence': -1e-3, 'damping_coefficient': -5e-3}
 THERMAL = Thermal(**COEFFICIENTS)

@@ -12,6 +12,8 @@ from hmsa import Actuator
 from hmsa.api.paths import smooth_points, wave_of, wave_path, wave_points
 from hmsa_ros.runtime.records import Settings, Stop, Trajectory
 
+pytestmark = pytest.mark.thorough
+
 SECOND = 1_000_000_000
 AMPLITUDE, LEAD = 0.1, 20 * MS
 NATURAL = math.sqrt(18.0 / (1.0 + C1)) / (2.0 * math.pi * TIME)
