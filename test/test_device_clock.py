@@ -106,8 +106,7 @@ def test_a_device_whose_clock_is_set_halts_the_plan_and_is_found_again(when, by)
     rig.settle()
     rig.set_device(-by)
     rig.run(rig.now + 1200 * MS)
-    rig.runtime.request(StretchRequest('a', 1.25))
-    rig.run(rig.now + LEAD + HOLD)
+    rig.go(StretchRequest('a', 1.25), rig.now + LEAD + HOLD)
     assert rig.status.verdict.severity is Severity.OK
     assert rig.residual(1.25) < 1e-6
 
@@ -116,36 +115,29 @@ def test_a_device_whose_clock_is_set_halts_the_plan_and_is_found_again(when, by)
 def test_without_samples_a_start_after_clocks_agree_again_knows_that_the_coil_was_off(by):
     rig = Apart()
     rig.samples = rig.observable = False
-    rig.runtime.request(trajectory((1.2, HOLD), (1.3, 8 * HOLD)))
-    rig.run(START + 130 * MS)
+    rig.go(trajectory((1.2, HOLD), (1.3, 8 * HOLD)), START + 130 * MS)
     rig.set_device(by * MS)
     rig.settle()
     assert rig.cut
     rig.set_device(-by * MS)
     rig.run(rig.now + SECOND)
-    rig.runtime.request(StretchRequest('a', 1.25))
-    rig.run(rig.now + LEAD + HOLD)
-    assert rig.residual(1.25) < 1e-6
+    rig.arrive(1.25, rig.now + LEAD + HOLD)
 
 
 def test_a_small_delay_of_a_device_at_rest_stops_nothing():
     rig = Apart()
-    rig.runtime.request(trajectory((1.2, HOLD), (1.3, 4 * SECOND)))
-    rig.run(START + SECOND)
+    rig.go(trajectory((1.2, HOLD), (1.3, 4 * SECOND)), START + SECOND)
     rig.set_device(-300 * MS)
     rig.run(rig.now + 2 * SECOND)
     assert rig.status.verdict.severity is Severity.OK
-    rig.runtime.request(StretchRequest('a', 1.1))
-    rig.run(rig.now + SECOND)
-    assert rig.residual(1.1) < 1e-6
+    rig.arrive(1.1, rig.now + SECOND)
 
 
 @pytest.mark.parametrize(('back', 'outage'), [
     (500, 1500), (1000, 1500), (2500, 10_000), (5000, 1500)])
 def test_receipts_are_accepted_after_an_outage_in_which_the_clock_was_set_back(back, outage):
     rig = Apart()
-    rig.runtime.request(StretchRequest('a', 1.2))
-    rig.run(START + SECOND)
+    rig.go(StretchRequest('a', 1.2), START + SECOND)
     rig.linked = False
     rig.run(rig.now + outage * MS // 2)
     rig.set_device(-back * MS)
@@ -155,8 +147,7 @@ def test_receipts_are_accepted_after_an_outage_in_which_the_clock_was_set_back(b
     assert 'no receipt' not in rig.status.unheard
     rig.set_device(back * MS)
     rig.run(rig.now + 1200 * MS)
-    rig.runtime.request(StretchRequest('a', 1.3))
-    rig.run(rig.now + SECOND)
+    rig.go(StretchRequest('a', 1.3), rig.now + SECOND)
     assert rig.status.verdict.severity is Severity.OK
     assert rig.residual(1.3) < 1e-6
 
@@ -250,8 +241,7 @@ def test_a_clock_of_both_that_is_set_is_no_difference(by):
 
 def test_a_clock_of_the_planner_alone_that_is_set_halts_the_plan():
     rig = Apart()
-    rig.runtime.request(trajectory((1.2, HOLD), (1.1, 6 * HOLD), (1.3, 8 * HOLD)))
-    rig.run(START + 130 * MS)
+    rig.go(trajectory((1.2, HOLD), (1.1, 6 * HOLD), (1.3, 8 * HOLD)), START + 130 * MS)
     # Seen by the planner, its clock was set ahead.
     rig.runtime.devices.receipts.clock_set()
     rig.set_device(-5 * SECOND)
@@ -265,8 +255,7 @@ SLOW = ((1.2, HOLD), (1.1, 6 * HOLD), (1.3, 8 * HOLD), (1.4, 10 * HOLD), (1.2, 4
 @pytest.mark.parametrize('outage', [320, 416, 700])
 def test_lateness_from_an_outage_is_no_reason_to_raise_lead_time(outage):
     rig = Bench()
-    rig.runtime.request(trajectory(*SLOW))
-    rig.run(START + 100 * MS)
+    rig.go(trajectory(*SLOW), START + 100 * MS)
     rig.linked = False
     rig.run(rig.now + outage * MS)
     rig.linked = True
@@ -280,8 +269,7 @@ def test_lateness_from_an_outage_is_no_reason_to_raise_lead_time(outage):
 
 def test_lateness_from_a_stall_of_the_planner_is_no_reason_to_raise_lead_time():
     rig = Bench(settings=replace(BEATING, replan_late=False))
-    rig.runtime.request(trajectory(*SLOW))
-    rig.run(START + 100 * MS)
+    rig.go(trajectory(*SLOW), START + 100 * MS)
     rig.now += 500 * MS
     rig.steady += 500 * MS
     rig.run(rig.now + 2 * SECOND)
@@ -302,8 +290,7 @@ def test_a_planner_that_was_starting_has_not_stood_still():
 
 def test_lateness_from_a_clock_is_no_reason_to_raise_lead_time():
     rig = Bench()
-    rig.runtime.request(trajectory(*SLOW))
-    rig.run(START + 100 * MS)
+    rig.go(trajectory(*SLOW), START + 100 * MS)
     rig.ahead = 41_500 * MS
     # What it applies has the timestamps of its clock.
     rig.runtime.applied('a', rig.now + rig.ahead, 0.03)
@@ -314,22 +301,19 @@ def test_lateness_from_a_clock_is_no_reason_to_raise_lead_time():
 def test_lateness_of_a_slow_link_is_a_reason_to_raise_lead_time_after_an_outage_too():
     rig = Bench()
     rig.transport = 60 * MS
-    rig.runtime.request(trajectory(*SLOW))
-    rig.run(START + 100 * MS)
+    rig.go(trajectory(*SLOW), START + 100 * MS)
     rig.linked = False
     rig.run(rig.now + 400 * MS)
     rig.linked = True
     rig.run(rig.now + 2 * SECOND)
-    rig.runtime.request(trajectory(*SLOW))
-    rig.run(rig.now + SECOND)
+    rig.go(trajectory(*SLOW), rig.now + SECOND)
     needed = re.search(r'raise lead_time to more than ([0-9.]+) s', rig.runtime.report()[1])
     assert 0.05 < float(needed[1]) < 0.075
 
 
 def test_the_level_of_a_coil_is_known_after_the_clock_of_the_planner_was_set():
     rig = Bench()
-    rig.runtime.request(StretchRequest('a', 1.2))
-    rig.run(START + SECOND)
+    rig.go(StretchRequest('a', 1.2), START + SECOND)
     rig.cut_off()
     rig.come_back()
     rig.hears = False
@@ -338,7 +322,6 @@ def test_the_level_of_a_coil_is_known_after_the_clock_of_the_planner_was_set():
     rig.runtime.clock_set(MS)
     rig.run(rig.now + 300 * MS)
     rig.hears = True
-    rig.runtime.request(StretchRequest('a', 1.3))
-    rig.run(rig.now + SECOND)
+    rig.go(StretchRequest('a', 1.3), rig.now + SECOND)
     assert rig.refused == []
     assert rig.residual(1.3) < 1e-6

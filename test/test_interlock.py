@@ -196,8 +196,7 @@ def test_a_planner_drops_its_plan_refuses_and_waits_to_be_asked(reaction, monkey
     received = rig.runtime.received
     monkeypatch.setattr(rig.runtime, 'received', lambda *x, **others: received(
         *x, **others, locked=rig.door))
-    rig.runtime.request(trajectory((1.2, 400 * MS), (1.4, 60_000 * MS)))
-    rig.run(START + 800 * MS)
+    rig.go(trajectory((1.2, 400 * MS), (1.4, 60_000 * MS)), START + 800 * MS)
     rig.open_door()
     rig.run(rig.now + 1500 * MS)
     assert rig.status.verdict.code == 'interlock'

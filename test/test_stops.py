@@ -18,8 +18,7 @@ LONG = ((1.1, HOLD), (1.2, 2 * HOLD), (1.3, 20 * SECOND))
 
 def moving(rig, span=47 * MS):
     """Return a rig in the first move of a sequence, or later."""
-    rig.runtime.request(trajectory(*LONG))
-    rig.run(START + span)
+    rig.go(trajectory(*LONG), START + span)
     return rig
 
 
@@ -61,8 +60,7 @@ def test_a_stop_has_stopped_once_its_last_level_was_acknowledged_at_its_time():
 
 def test_a_stop_at_rest_is_acknowledged_too():
     rig = moving(Bench(), SECOND)
-    rig.runtime.request(Stop('the stop'))
-    rig.run(rig.now + SECOND)
+    rig.go(Stop('the stop'), rig.now + SECOND)
     assert outcomes(rig) == ['accepted', 'stopped']
 
 
@@ -72,10 +70,8 @@ def test_a_stop_at_rest_is_acknowledged_by_hardware_that_rounds_times_and_levels
     # As a serial board: levels in steps of 1 uT, and times in steps of 1 us.
     monkeypatch.setattr(rig.runtime, 'applied', lambda joint, stamp, level: hear(
         joint, stamp - 438, round(level, 6)))
-    rig.runtime.request(trajectory(*LONG))
-    rig.run(START + SECOND)
-    rig.runtime.request(Stop('the stop'))
-    rig.run(rig.now + SECOND)
+    rig.go(trajectory(*LONG), START + SECOND)
+    rig.go(Stop('the stop'), rig.now + SECOND)
     assert outcomes(rig) == ['accepted', 'stopped']
 
 
@@ -93,11 +89,9 @@ def test_a_plan_that_goes_on_without_the_lost_levels_of_a_stop_is_no_stop():
 @pytest.mark.parametrize('fault', ['hears', 'linked'])
 def test_a_stop_that_does_not_arrive_has_not_stopped_until_it_does(fault):
     rig = Bench()
-    rig.runtime.request(trajectory(*LONG))
-    rig.run(START + 200 * MS)
+    rig.go(trajectory(*LONG), START + 200 * MS)
     setattr(rig, fault, False)
-    rig.runtime.request(Stop('the stop'))
-    rig.run(rig.now + 6 * SECOND)
+    rig.go(Stop('the stop'), rig.now + 6 * SECOND)
     assert outcomes(rig) == ['accepted', 'unheard']
     assert rig.status.verdict.severity is Severity.ERROR
     assert 'has not acknowledged it for 2.' in rig.status.verdict.message
@@ -116,8 +110,7 @@ def test_a_stop_is_sent_to_a_device_whose_receipts_are_silent():
     rig.run(START + 1380 * MS)
     assert rig.runtime.devices.receipts.silent
     rig.run(START + 1600 * MS)
-    rig.runtime.request(Stop('the stop'))
-    rig.run(rig.now + 4 * SECOND)
+    rig.go(Stop('the stop'), rig.now + 4 * SECOND)
     assert outcomes(rig) == ['accepted', 'unheard']
     level = rig.planner.plan.levels[-1].flux_density
     assert rig.wire == []
@@ -135,8 +128,7 @@ def test_a_stop_that_a_silent_device_may_have_carried_out_is_sent_once(monkeypat
     rig.mute, hear = True, rig.runtime.applied
     monkeypatch.setattr(rig.runtime, 'applied', lambda *report: reports.append(report))
     rig.run(START + 1600 * MS)
-    rig.runtime.request(Stop('the stop'))
-    rig.run(rig.now + SECOND)
+    rig.go(Stop('the stop'), rig.now + SECOND)
     assert reports
     count = len(rig.sent)
     rig.run(rig.now + 25 * SECOND, step=20 * MS)
@@ -154,8 +146,7 @@ def test_a_stop_that_a_silent_device_may_have_carried_out_is_sent_once(monkeypat
 def test_the_lost_levels_of_a_stop_are_planned_anew_only_once_the_device_is_heard():
     rig = moving(Bench())
     rig.hears = False
-    rig.runtime.request(Stop('the stop'))
-    rig.run(rig.now + 2 * SECOND)
+    rig.go(Stop('the stop'), rig.now + 2 * SECOND)
     rig.mute = True
     rig.run(rig.now + SECOND)
     assert rig.runtime.devices.receipts.silent
@@ -172,8 +163,7 @@ def test_the_lost_levels_of_a_stop_are_planned_anew_only_once_the_device_is_hear
 def test_no_level_is_sent_in_vain_while_commands_do_not_arrive():
     rig = moving(Bench())
     rig.hears = False
-    rig.runtime.request(Stop('the stop'))
-    rig.run(rig.now + 2 * SECOND)
+    rig.go(Stop('the stop'), rig.now + 2 * SECOND)
     count = rig.runtime.devices.sent
     rig.run(rig.now + 25 * SECOND, step=20 * MS)
     assert rig.runtime.devices.sent == count
@@ -187,8 +177,7 @@ def test_no_level_is_sent_in_vain_while_commands_do_not_arrive():
 def test_a_stop_is_not_carried_out_before_its_time_by_the_clock_of_the_device():
     rig = moving(Bench())
     rig.ahead = -5 * SECOND
-    rig.runtime.request(Stop('the stop'))
-    rig.run(rig.now + 8 * SECOND)
+    rig.go(Stop('the stop'), rig.now + 8 * SECOND)
     assert outcomes(rig) == ['accepted', 'clocks_differ', 'unheard']
     assert 'behind that of the planner' in rig.status.verdict.message
     assert rig.status.verdict.message.endswith('switch the coil off there')
@@ -202,11 +191,9 @@ def test_without_receipts_a_reported_level_counts():
 
 def test_without_receipts_another_level_in_force_is_no_stop():
     rig = Steady()
-    rig.runtime.request(trajectory(*LONG))
-    rig.run(START + 47 * MS)
+    rig.go(trajectory(*LONG), START + 47 * MS)
     rig.hold_back = True
-    rig.runtime.request(Stop('the stop'))
-    rig.run(rig.now + 5 * SECOND)
+    rig.go(Stop('the stop'), rig.now + 5 * SECOND)
     assert outcomes(rig) == ['accepted', 'unheard']
     assert 'T was commanded: switch the coil off there' in rig.status.verdict.message
 
@@ -223,8 +210,7 @@ def test_without_any_report_it_is_said_that_nothing_is_known(monkeypatch):
 def test_without_a_device_nothing_has_stopped():
     rig = Steady()
     rig.unheard = 'no node subscribes to flux_density_command: start a plant or a driver'
-    rig.runtime.request(Stop('the stop'))
-    rig.run(rig.now + 5 * SECOND)
+    rig.go(Stop('the stop'), rig.now + 5 * SECOND)
     assert outcomes(rig) == ['accepted', 'unheard']
     assert 'start a plant or a driver' in rig.status.verdict.message
 
@@ -257,13 +243,11 @@ def test_a_coil_that_is_cut_off_has_stopped():
 
 def test_a_request_that_follows_a_stop_ends_it_and_a_refused_one_does_not():
     rig = stopped_in_the_middle(Bench())
-    rig.runtime.request(StretchRequest('a', 9.0, 'refused'))
-    rig.run(START + 500 * MS)
+    rig.go(StretchRequest('a', 9.0, 'refused'), START + 500 * MS)
     assert outcomes(rig) == ['accepted', 'stopped']
     assert rig.status.answers['refused'][0].code == 'out_of_range'
     rig = stopped_in_the_middle(Bench())
-    rig.runtime.request(StretchRequest('a', 1.3, 'taken'))
-    rig.run(START + 3 * SECOND)
+    rig.go(StretchRequest('a', 1.3, 'taken'), START + 3 * SECOND)
     assert outcomes(rig) == ['accepted']
 
 
