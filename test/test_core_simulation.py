@@ -11,15 +11,10 @@ from scipy.integrate import solve_ivp, trapezoid
 
 from hmsa.errors import BadInputError, HmsaError
 from hmsa.model.equations import damping, elastic_force, energy, equilibrium_stretch, mass
-from hmsa.model.moves import Level, Setpoint, State
+from hmsa.model.moves import Setpoint
 from hmsa.model.parameters import NondimensionalParameters, paper_actuator
 from hmsa.model.schedule import CommandSchedule
-from hmsa.model.simulation import (
-    ActuatorSimulation,
-    longest_motion,
-    sampled,
-    simulate,
-)
+from hmsa.model.simulation import ActuatorSimulation, longest_motion, simulate
 from hmsa.planning.sequence import plan_sequence
 
 PAPER = NondimensionalParameters()
@@ -94,16 +89,6 @@ def test_ramps_are_followed():
     assert (stretch[0], rate[0]) == pytest.approx(tuple(end.y[:, -1]), abs=1e-11)
 
 
-def test_a_tighter_tolerance_is_closer():
-    levels, end = [Level(0.0, 1.0)], np.array([5.0])
-    exact = sampled(levels, State(1.0), end, PAPER)[:2, 0]
-    errors = [
-        np.max(np.abs(sampled(levels, State(1.0), end, PAPER, rtol=rtol)[:2, 0] - exact))
-        for rtol in (1e-4, 1e-7, 1e-10)]
-    assert errors[0] > errors[1] > errors[2]
-    assert errors[2] < 1e-8
-
-
 def test_numbers_below_the_least_normal_one_are_zero_in_the_motion_alone():
     # x86 takes ten times as long with them.
     least = np.finfo(float).tiny
@@ -121,28 +106,19 @@ def test_an_equilibrium_is_kept():
         assert abs(rate[0]) < 1e-11
 
 
-@pytest.mark.parametrize('arguments', [
-    {'switches': [0.0, 1.0]}, {'loads': [[1.0]]}, {'slopes': [0.0, 1.0]},
-    {'switches': [], 'loads': []}, {'times': [[1.0]]}])
-def test_shapes_that_do_not_fit_are_refused(arguments):
+@pytest.mark.parametrize(('arguments', 'said'), [
+    *((x, 'one-dimensional arrays') for x in (
+        {'switches': [0.0, 1.0]}, {'loads': [[1.0]]}, {'slopes': [0.0, 1.0]},
+        {'switches': [], 'loads': []}, {'times': [[1.0]]})),
+    *(({name: [value]}, 'finite') for name in ('switches', 'loads', 'times', 'slopes')
+      for value in (math.nan, math.inf)),
+    *(({'switches': switches, 'loads': [0.1, 0.2], 'times': times}, 'must not decrease')
+      for switches, times in (
+          ([1.0, 0.0], [2.0]), ([0.0, 1.0], [2.0, 1.0]), ([0.0, 1.0], [-1.0])))])
+def test_arrays_that_do_not_fit_are_refused(arguments, said):
     good = {'switches': [0.0], 'loads': [1.0], 'times': [1.0]}
-    with pytest.raises(BadInputError, match='one-dimensional arrays'):
+    with pytest.raises(BadInputError, match=said):
         simulate(**(good | arguments), material=PAPER)
-
-
-@pytest.mark.parametrize('name', ['switches', 'loads', 'times', 'slopes'])
-@pytest.mark.parametrize('value', [math.nan, math.inf])
-def test_values_that_are_not_finite_are_refused(name, value):
-    good = {'switches': [0.0], 'loads': [1.0], 'times': [1.0], 'slopes': [0.0]}
-    with pytest.raises(BadInputError, match='finite'):
-        simulate(**(good | {name: [value]}), material=PAPER)
-
-
-@pytest.mark.parametrize(('switches', 'times'), [
-    ([1.0, 0.0], [2.0]), ([0.0, 1.0], [2.0, 1.0]), ([0.0, 1.0], [-1.0])])
-def test_times_out_of_order_are_refused(switches, times):
-    with pytest.raises(BadInputError, match='must not decrease'):
-        simulate(switches, [0.1, 0.2], times, PAPER)
 
 
 @pytest.mark.parametrize('stretch', [0.0, -1.0, 0.25, 2.7, math.nan, math.inf])
@@ -251,20 +227,6 @@ def test_the_schedule_supersedes_as_a_naive_one_does(steps):
         assert len(schedule) == naive.ahead(now)
 
 
-def test_a_command_drops_those_stamped_at_or_after_it_and_no_others():
-    schedule = CommandSchedule(0.0)
-    for stamp in (10, 20, 30):
-        schedule.insert(stamp, float(stamp))
-    schedule.insert(20, 21.0)
-    assert len(schedule) == 2
-    found = []
-    while schedule.next_stamp is not None:
-        stamp = schedule.next_stamp
-        schedule.apply_next()
-        found.append((stamp, schedule.current))
-    assert found == [(10, 10.0), (20, 21.0)]
-
-
 # -- the actuator over time ---------------------------------------------------------------------
 
 
@@ -312,14 +274,6 @@ def test_a_late_command_applies_at_once_and_says_how_late_it_is():
     simulation.advance(9_000_000)
     expected = expected_state(1_000_000, 9_000_000, [(3_000_000, 0.02)])
     assert (simulation.stretch, simulation.rate) == pytest.approx(expected, rel=1e-11)
-
-
-def test_a_command_for_now_is_not_late():
-    simulation = ActuatorSimulation(ACTUATOR, time=5)
-    assert simulation.command(5, 0.02) == 0
-    simulation.advance(5)
-    assert simulation.flux_density == 0.02
-    assert simulation.stretch == 1.0
 
 
 def test_a_time_that_is_not_ahead_changes_nothing():
