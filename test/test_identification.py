@@ -496,6 +496,15 @@ def test_intervals_of_one_step_of_sixty_points_with_wrong_stamps_cover_the_truth
     assert (warned == 8) == bool(jitter)
 
 
+def test_a_switch_at_the_end_of_its_interval_does_not_keep_a_search_from_converging():
+    time, switches, levels = np.arange(1000) / 1e3, np.array([0.0, 0.1, 0.6]), [0.0, 0.05, 0.0]
+    seen = simulate(time, switches, levels)
+    for seed in range(4):
+        noise = np.random.default_rng(seed).normal(0.0, 1e-3, len(time))
+        found = identify(Measurement(time, seen + noise, switches, levels, earlier=1e-3))
+        assert found.fit.converged
+
+
 @pytest.mark.parametrize(('change', 'message'), [
     (lambda x: {'stretch': np.ones(1200)}, 'stays within 0.*expected a motion'),
     (lambda x: {'stretch': 1.0 + 1e-3 * np.random.default_rng(0).standard_normal(1200)},

@@ -260,6 +260,12 @@ class _Search:
         prior, first = self._prior(scale), len(self._free)
         matrix[first:, first:] += prior * np.eye(len(shifts))
         gradient[first:] -= prior * (shifts - self._middle)
+        # A switch at the end of its interval that would leave it stays there (active set).
+        held = np.flatnonzero((shifts >= 0.0) & (gradient[first:] > 0.0) | (
+            shifts <= -self._recording.earlier) & (gradient[first:] < 0.0)) + first
+        gradient[held] = 0.0
+        matrix[held] = matrix[:, held] = 0.0
+        matrix[held, held] = 1.0
         size = np.sqrt(np.maximum(np.diag(matrix), 1e-12))
         return matrix / np.outer(size, size), gradient, size
 
