@@ -1,6 +1,7 @@
 """``hmsa identify``: files in, numbers, files and exit codes out."""
 
 import json
+import math
 import re
 
 from identification_oracle import BLOCK, simulate, steps
@@ -201,6 +202,18 @@ def test_what_is_no_stretch_is_refused_with_what_it_looks_like(
     status, out, err = identify(capsys, 'camera.csv', '--commands', 'levels.csv')
     assert (status, out, err.count('\n')) == (2, '', 1)
     assert re.search(message, err)
+
+
+def test_samples_of_a_sensor_that_lost_the_actuator_are_refused_until_they_are_missing(
+        folder, capsys):
+    rows = [(t, 0.0 if 0.1 < t < 0.14 else y) for t, y in zip(TIMES, STRETCH, strict=True)]
+    write('camera.csv', 'time,stretch', rows)
+    status, _, err = identify(capsys, 'camera.csv', '--commands', 'levels.csv')
+    assert status == 2
+    assert re.search(r' samples that are no stretch, such as 0 at 0\.1.*: expected 0\.', err)
+    assert 'leave their cells empty' in err
+    write('camera.csv', 'time,stretch', ((t, y or math.nan) for t, y in rows))
+    assert identify(capsys, 'camera.csv', '--commands', 'levels.csv')[0] == 0
 
 
 def test_a_length_at_rest_in_another_unit_is_refused_with_what_was_taken(folder, capsys):

@@ -177,6 +177,14 @@ class Measurement:
         least, most = what.at_rest if seen else what.possible
         if least <= rest <= most and what.possible[0] <= low and high <= what.possible[1]:
             return
+        lost = (self.stretch < what.possible[0]) | (self.stretch > what.possible[1])
+        if least <= rest <= most and np.mean(lost) <= _MOST_LEFT_OUT:
+            place = int(np.argmax(lost))
+            raise BadInputError(
+                f'{self.label} has {np.count_nonzero(lost)} of {len(lost)} samples that are no '
+                f'{what.name}, such as {self.stretch[place]:.4g} at {self.time[place]:.6g} s: '
+                f'expected {what.possible[0]:g} to {what.possible[1]:g}; if the sensor lost the '
+                'actuator there, leave their cells empty')
         # A length in m is small too, but never near 0 compared with its rest value.
         strain = abs(rest) < 0.4 and not 0.0 < rest < 3.0 * low if seen else (
             low < what.possible[0])
