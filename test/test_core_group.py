@@ -471,6 +471,14 @@ def test_rest_is_believed_where_the_model_would_have_it_move():
     assert (state.stretch, state.rate) == (1.3, 0.0)
 
 
+def test_an_estimate_is_asked_for_once_where_the_rest_of_a_plan_is_possible_at_once():
+    planner, asked = Planner(paper_actuator(), Options()), []
+    planner.request(SOME, None, START)
+    planner.believed = asked.append
+    assert planner.draft_resumption(START + MS) is not None
+    assert len(asked) == 1
+
+
 @pytest.mark.parametrize('seen', [0.998, 1.0005, 1.004])
 def test_noise_of_a_sensor_at_rest_is_no_motion(seen):
     planner = Planner(paper_actuator(), Options())

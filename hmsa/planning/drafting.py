@@ -32,8 +32,8 @@ PathPoint = tuple[float, float, float]
 
 # Fractions of the hardest braking to try, in this order, if that leads to no plan.
 _BRAKE_SHARES = (0.5, 0.1, 0.02, 0.0)
-# Natural periods by which to delay another attempt if resuming at once is impossible.
-_PATIENCE = (0.0, 0.15, 0.3, 0.45, 0.6)
+# Natural periods by which to delay further attempts if resuming at once is impossible.
+_PATIENCE = (0.15, 0.3, 0.45, 0.6)
 # Deviation of the field from the holding load that counts as settled, as a fraction of the load.
 _SETTLED = 1e-6
 # Rates up to this, in 1/s, count as rest at the end of a path.
@@ -257,7 +257,7 @@ def _settled(model: JointModel, state: State) -> bool:
 
 
 def later_starts(model: JointModel, stretch: float, begin: int) -> Iterator[int]:
-    """Yield times in ns at which to try in turn; ``stretch`` is that at the first of them."""
+    """Yield later times in ns at which to try in turn; ``stretch`` is that at the first time."""
     period = 2.0 * math.pi / model.frequency(stretch)
     for share in _PATIENCE:
         yield model.on_grid(begin + model.ns(share * period))

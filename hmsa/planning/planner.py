@@ -6,7 +6,8 @@ Times are integer nanoseconds of the caller's clock. A request first becomes a d
 take all of a request or none of it (`hmsa.planning.group`).
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from copy import copy
 from dataclasses import replace
 import math
@@ -252,17 +253,19 @@ class Planner(RunningPlan):
         """Draft the rest of the plan again from the present motion, to arrive in time if given."""
         # None if nothing is left. Start at the earliest time that a command can reach or, if no
         # plan is possible from the motion then, a fraction of a period later.
-        begin, *more = self.resumptions(now)
+        begin = self._resumption(now)
         start = self._plan_start(begin)
-        if arrival is not None:
+        try:
             return drafting.draft_resumption(start, arrival)
-        for later in (begin, *more):
-            try:
-                return drafting.draft_resumption(self._plan_start(later))
-            except RefusedError:
+        except RefusedError:
+            if arrival is not None:
+                raise
+            for later in self._later_starts(start):
                 # Another phase of the motion may allow it.
                 self.check()
-        return drafting.draft_resumption(start)
+                with suppress(RefusedError):
+                    return drafting.draft_resumption(self._plan_start(later))
+            raise
 
     def draft_later(self, place: int) -> Draft:
         """Draft the setpoints of the plan from an index on again; those before it stay."""
@@ -289,11 +292,18 @@ class Planner(RunningPlan):
 
     def resumptions(self, now: int) -> tuple[int, ...]:
         """Return the times in ns from which the rest of the plan may be planned again."""
+        begin = self._resumption(now)
+        return begin, *self._later_starts(self._plan_start(begin))
+
+    def _resumption(self, now: int) -> int:
+        """Return the earliest of these times."""
         begin = self.soonest(now)
-        if self.plan.segments:
-            begin = max(begin, self.plan.segments[0].since)
-        return tuple(dict.fromkeys(drafting.later_starts(
-            self.model, self._plan_start(begin).state.stretch, begin)))
+        return self.model.on_grid(max(begin, self.plan.segments[0].since)) if (
+            self.plan.segments) else begin
+
+    def _later_starts(self, start: PlanStart) -> Iterator[int]:
+        """Yield the others, which follow from the motion at the first one."""
+        return drafting.later_starts(self.model, start.state.stretch, start.begin)
 
     def start(self, stamp: int | None, now: int) -> int:
         """Return the earliest start in ns of a request for a timestamp; None for now."""

@@ -84,7 +84,8 @@ def replanning(
         anew = make(now)
         if anew is None:
             return None
-        plan = planner.snapshot((*planner.resumptions(now), *anew.starts))
+        # What is brief is drafted at once.
+        plan = planner if brief else planner.snapshot((*planner.resumptions(now), *anew.starts))
 
         def draft(check: Check) -> dict[str, Any]:
             return {name: anew.draft(plan.checked(check))}
