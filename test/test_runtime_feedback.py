@@ -4,6 +4,7 @@ from dataclasses import replace
 from functools import partial
 import math
 
+from at_work import AtWork, planner
 from beam_oracle import silicone
 import numpy as np
 import pytest
@@ -28,6 +29,7 @@ from hmsa_ros.runtime.records import (
     Severity,
     StatusChanged,
     StretchRequest,
+    Trajectory,
 )
 from hmsa_studies.commanders import SCENARIOS
 
@@ -102,6 +104,33 @@ def test_adapting_knows_the_creep_of_the_block(factor):
     assert f'G about {"+" if factor > 1.0 else "-"}10 %; plans use it' in estimates(
         loop)[-1].message
     assert codes(loop)[-1] == 'arrived'
+
+
+def test_joints_among_many_are_updated_when_samples_show_how_they_arrive_and_all_corrected():
+    names = 'abcdef'
+    work = AtWork({x: planner() for x in names}, Settings(takeover_timeout=0, feedback='adapt'))
+    real = replace(paper_actuator(), shear_modulus=1.2e4)
+    device = SimulatedDevice(
+        [SimulatedJoint(Setup(real, real.rest), errors=SensorErrors(1e-3)) for _ in names],
+        period=MS, time=START, seed=1)
+    work.runtime.request(Trajectory(
+        tuple(names), [((1.4,) * len(names), 300 * MS)], 1, name='x'))
+    work.tick()
+    arrival = work.planner.plan.segments[-1].arrival
+    while work.now < START + 600 * MS:
+        for command in work.tick():
+            device.receive(names.index(command.joint), command.stamp, command.flux_density)
+        work.now += MS
+        device.advance(work.now)
+        for change in device.changes():
+            work.runtime.applied(names[change.joint], change.stamp, change.level)
+        for taken in device.samples():
+            for name, stretch in zip(names, taken.stretch, strict=True):
+                work.show(taken.time, stretch, name)
+    first = {x.joint: x.time for x in reversed(work.outputs_of(EstimateChanged))}
+    assert set(first) == set(names)
+    assert min(first.values()) > arrival
+    assert device.stretch == pytest.approx([1.4] * len(names), abs=2e-3)
 
 
 def moved(loop, target):

@@ -14,7 +14,7 @@ from hmsa.model.equations import equilibrium_stretch
 from hmsa.model.units import flux_text, NANOSECONDS
 from hmsa.offload import Awaited, Doing
 from hmsa.planning.planner import Believed, Planner
-from hmsa.planning.timeline import JointModel, Timeline
+from hmsa.planning.timeline import JointModel, PlannedSegment, Timeline
 from hmsa_lab.adapt.estimator import Estimator, EstimatorOptions, StateEstimate
 from hmsa_lab.adapt.expected_error import clearly_better
 from hmsa_lab.adapt.learnt import (
@@ -565,8 +565,11 @@ class AdaptiveJoint:
         """Return whether samples until a time show how the joint has arrived."""
         plan = self.planner.plan
         place = plan.under_way(self.planner.soonest(time))
-        look = round(_LOOK * self.unit * NANOSECONDS)
-        return place >= 0 and time >= (plan.segments[place].arrival or 0) + look
+        return place >= 0 and time >= self.shown_from(plan.segments[place])
+
+    def shown_from(self, segment: PlannedSegment) -> int:
+        """Return the time from which samples show how the joint has arrived at a setpoint."""
+        return (segment.arrival or 0) + round(_LOOK * self.unit * NANOSECONDS)
 
     def choose(self, latest: StateEstimate, doing: Doing) -> Awaited[None]:
         """Adopt learnt parameters once clearly better, or while a move waits for them."""

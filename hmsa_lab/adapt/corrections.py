@@ -91,6 +91,7 @@ class Corrections:
         joint.moves = Moves(not same_parameters(
             joint.based(draft.levels[-1].model), joint.given), joint.doubted)
         joint.next_update = joint.next_sample = joint.waits = 0
+        self._feedback.wait_for(joint, segment)
         # An amplifier that saturated may not do so any more.
         joint.largest = math.inf
         if estimate is None or segment.arrival is None or segment.code in (
@@ -111,7 +112,7 @@ class Corrections:
         arrival = segment.begin + round(longer * duration)
         if rest:
             arrival = max(min(arrival, rest[0].begin), segment.arrival)
-        joint.waits = arrival
+        joint.waits, joint.next_update = arrival, 0
         return replace(draft, segments=(replace(segment, arrival=arrival), *rest))
 
     def due(self, now: int) -> Iterator[PlanningTask]:

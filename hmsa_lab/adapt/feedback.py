@@ -10,7 +10,7 @@ from hmsa.judge.setpoint_samples import SetpointSamples
 from hmsa.offload import ANSWER, at_once, Awaited, Doing, goes_on, here, is_ready, start
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Believed
-from hmsa.planning.timeline import JointModel
+from hmsa.planning.timeline import JointModel, PlannedSegment
 from hmsa_lab.adapt.adaptive_joint import AdaptiveJoint, RESTING
 from hmsa_lab.adapt.corrections import Corrections
 from hmsa_lab.adapt.learnt import same_parameters, save
@@ -184,6 +184,12 @@ class Feedback(Follower):
         return min((x.next_look if x.fresh else 0 for x in joints if x.fresh or x.audits),
                    default=None)
 
+    def wait_for(self, joint: AdaptiveJoint, segment: PlannedSegment) -> None:
+        """Update a joint among many only when samples show how it has arrived."""
+        # Sooner, it changes no plan, and keeps an update of another joint waiting.
+        if _SHARED * len(self.joints) > _IDLE:
+            joint.next_update = max(joint.next_update, joint.shown_from(segment))
+
     def give_way(self, now: int) -> None:
         """Update less often from a time in ns on, since commands have been kept waiting."""
         self._seldom = min(2.0 * self._seldom, _SELDOM)
@@ -241,6 +247,10 @@ class Feedback(Follower):
         self.spent(joint, joint.spent)
         self._seldom = max(_OFTENER * self._seldom, 1.0)
         joint.next_update = now + joint.interval
+        plan = joint.planner.plan
+        place = plan.under_way(joint.planner.soonest(now))
+        if place >= 0 and now >= joint.waits:
+            self.wait_for(joint, plan.segments[place])
         if now >= joint.next_report:
             joint.next_report = now + _REPORT
             self._report(joint, now)

@@ -115,7 +115,7 @@ class Runtime:
         self._last_jump: int | None = None
         self._set_back = 0
         self._differ = False  # whether a clock offset was reported
-        self._put_off = False  # whether the last tick left judging to the next one
+        self._put_off = False  # whether the last tick left plans and judging to the next one
         self._impossible_due = Throttle()
 
     def _follow(self) -> None:
@@ -517,7 +517,9 @@ class Runtime:
         if self._send(now):
             self._beat(now)
             estimated = self.follower.update(now)
-        if not estimated and self._may_plan():
+        # Where a tick takes as long as an update, updates end in every tick.
+        self._put_off = estimated and not self._put_off
+        if not self._put_off and self._may_plan():
             self.planning.work_on()
         if self._reporting.preview_again is not None and now >= self._reporting.preview_again:
             self._reporting.show()
@@ -527,8 +529,6 @@ class Runtime:
                 self._watch.open or self._reporting.unheard or self._reporting.unseen
                 or self.devices.receipts or self._reporting.next_change is not None):
             self._reporting.look_for_listeners()
-            # Where a tick takes as long as an update, updates end in every tick.
-            self._put_off = estimated and not self._put_off
             if not self._put_off:
                 self._judge(now)
         if (verdict := self._stops.look(now)) is not None:
