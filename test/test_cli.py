@@ -113,6 +113,7 @@ def test_bad_input_is_answered_in_one_line_with_status_2(words, said, capsys):
     ('plan 1.1:10 --shaper zv --errors 0.1,0.1,0.1', '--shaper minimax'),
     ('plan 1.1:10 --periods 2', '--shaper smooth'),
     ('plan 1.1:10 --max-rate 2', '--shaper smooth'),
+    ('identify bag --accept', '--out'),
     ('simulate levels.csv --seed 1', '--noise'), ('watch --timeout 1', '--once'),
     ('report bag --width 85', '--picture'), ('compare a b --data', '--picture'),
     ('sweep --show residual', '--picture or --out'), ('robustness --seeds 2', '--feedback')])

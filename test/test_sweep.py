@@ -224,7 +224,10 @@ def test_a_law_of_many_constants_takes_no_room_for_each_row(monkeypatch):
     (['--zeta', 'sobol:1:1'], 'LOW below HIGH'),
     (['--zeta', 'normal:1'], 'sobol:LOW:HIGH'),
     (['--zeta', 'normal:1:nan'], 'STD above 0'),
-    (['--samples', '4'], 'without a random column'),
+    (['--samples', '4'], '--samples is given without a random column'),
+    (['--seed', '4'], '--seed is given without a random column'),
+    *((['--out', 'sweep.csv', *x], f'{x[0]} needs --picture or a folder as --out') for x in (
+        ['--width', '85'], ['--format', 'svg'], ['--data'], ['--show', 'b_p'])),
     (['--zeta', 'sobol:0:1', '--samples', '0'], '0 samples'),
     (['--zeta', 'sobol:0:1', '--seed', '-1'], 'seed of the samples is -1'),
     (['--identified'], '--identified without --params-file'),
@@ -234,6 +237,20 @@ def test_axes_that_do_not_exist_are_refused_in_one_line(run, words, message):
     status, out, err = run('sweep', *words)
     assert (status, out, err.count('\n')) == (2, [], 1)
     assert message in err
+
+
+def test_what_a_file_says_of_planning_and_options_decide_is_said(run, params_file):
+    path = params_file(shaper='robust', robust_order=3, smooth_periods=1, command_mode='sampled')
+    for words, unused in (
+            (['plan', '1.1:0.1'],
+             'shaper robust (see --shaper), robust_order 3 (see --order), command_mode sampled'),
+            (['plan', '1.1:0.1', '--shaper', 'robust', '--order', 3], 'command_mode sampled'),
+            (['sweep'], 'shaper robust (see --shaper), robust_order 3, command_mode sampled'),
+            (['sweep', '--shaper', 'step'], 'robust_order 3, command_mode sampled')):
+        status, _, err = run(*words, '--params-file', path)
+        assert status == 0
+        assert f'{path}: {unused} {"are" if "," in unused else "is"} not used' in err
+    assert 'not used' not in run('plan', '1.1:0.1', '--params-file', params_file())[2]
 
 
 def test_nondimensional_parameters_do_not_go_with_a_parameter_file(run, params_file):

@@ -61,7 +61,7 @@ def add_parser(subparsers: Any) -> None:
          'replaces an existing file'),
         ('--accept',
          'also write the file if the model is rejected for a defect that leaves at most 5 %% of a '
-         'step; the exit status is then 3'),
+         'step; the exit status is then 3', {'needs': ('--out',)}),
         ('--report', 'HTML', Path,
          'HTML page to write: data, fit, residuals and intervals; an existing file is replaced'),
         JSON)

@@ -134,6 +134,38 @@ def assume_example() -> None:
         f'{1.0 / block.period:.3g} Hz')
 
 
+# What a parameter file says of planning: the option for it, if there is one, and the defaults.
+_PLANNING: dict[str, tuple[Any, ...]] = {
+    'shaper': ('shaper', 'two_step'), 'robust_order': ('order', 2),
+    'minimax_errors': ('errors', [0.1, 0.1, 0.1]), 'minimax_file': ('', ''),
+    'smooth_periods': ('periods', 1.0), 'stretch_rate_max': ('max_rate', 0.0),
+    'initial_stretch': ('start', 1.0, 0.0), 'command_mode': ('', 'continuous'),
+    'short_spell': ('', 'refuse')}
+
+
+def assume_options(arguments: argparse.Namespace) -> None:
+    """
+    State what a parameter file says of planning and a command without ROS does not use.
+
+    Such a command takes actuator and coil from the file, and how to plan from its options.
+    """
+    from hmsa.interfaces.topics import PLANNER
+    from hmsa.runs.parameters import read_parameter_file
+
+    known = {action.dest: action for action in arguments.parser._actions}
+    values, unused = read_parameter_file(arguments.params_file), []
+    for name, (option, *defaults) in _PLANNING.items():
+        value = values.get(f'{PLANNER}.{name}')
+        given = option in known and getattr(arguments, option) != known[option].default
+        if not (given or value is None or value in defaults):
+            unused.append(f'{name} {value}' + (
+                f' (see --{option.replace("_", "-")})' if option in known else ''))
+    if unused:
+        assume(
+            f'{arguments.params_file}: {", ".join(unused)} {"is" if len(unused) == 1 else "are"} '
+            'not used, since options, not the file, determine how to plan')
+
+
 def timeout_of(arguments: argparse.Namespace) -> float:
     """Return the time limit in s; raise `BadInputError` if invalid."""
     timeout: float = arguments.timeout
@@ -198,10 +230,17 @@ def check_needs(arguments: argparse.Namespace) -> None:
         found = getattr(arguments, actions[option].dest)
         return found == value if value else found not in (None, False, actions[option].default)
 
-    for option, action in actions.items():
-        needs = getattr(action, 'needs', ())
-        if needs and given(option) and not any(given(*x.split()) for x in needs):
+    for option, needs in given_with_needs(arguments):
+        if not any(given(*x.split()) for x in needs):
             raise BadInputError(f'{option} needs {" or ".join(needs)}')
+
+
+def given_with_needs(arguments: argparse.Namespace) -> list[tuple[str, tuple[str, ...]]]:
+    """Return the given options that need others, and these."""
+    return [
+        (action.option_strings[0], needs) for action in arguments.parser._actions
+        if (needs := getattr(action, 'needs', ()))
+        and getattr(arguments, action.dest) not in (None, False, action.default)]
 
 
 def show(

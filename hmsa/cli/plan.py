@@ -17,6 +17,7 @@ from typing import Any, TYPE_CHECKING
 from hmsa.cli.options import (
     add_command,
     argument,
+    assume_options,
     law_of,
     LAW_OPTION,
     MATERIAL,
@@ -81,7 +82,8 @@ def add_parser(subparsers: Any) -> None:
         ('--max-rate', 'R', float, 'maximum stretch rate of a smooth move (default unlimited)',
          {'default': math.inf, 'needs': ('--shaper smooth',)}),
         ('--params-file', 'YAML', Path,
-         'parameter file (YAML) of planner and plant, for a plan in seconds and tesla'),
+         'parameter file (YAML) of planner and plant, for a plan in seconds and tesla; actuator '
+         'and coil are those of the file, shaper and its settings those of the options'),
         temperature_option(
             'with --params-file: temperature of block and coil in degrees Celsius; the file has '
             'the coefficients, thermal.* (default: its thermal.reference)'),
@@ -118,6 +120,7 @@ def _in_units(arguments: argparse.Namespace) -> int:
 
     check_targets(arguments.out, sources=(arguments.path, arguments.params_file))
     actuator = _actuator(arguments)
+    assume_options(arguments)
     shaper = arguments.shaper or 'two_step'
     if arguments.path is not None:
         return _along(actuator, arguments)

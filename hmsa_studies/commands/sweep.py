@@ -19,7 +19,7 @@ from pathlib import Path
 import shutil
 from typing import Any, TYPE_CHECKING
 
-from hmsa.cli.options import add_command, MATERIAL
+from hmsa.cli.options import add_command, assume_options, given_with_needs, MATERIAL
 from hmsa.cli.pictures import formats_of, paper_of, picture_options
 from hmsa.cli.terminal import progress
 from hmsa.errors import BadInputError, check_choice
@@ -71,7 +71,7 @@ def add_parser(subparsers: Any) -> None:
         ('--identified',
          'sample the normal distribution that hmsa identify stored in --params-file'),
         ('--samples', 'N', int, 'number of random samples (default 1024)'),
-        ('--seed', 'S', int, 'seed of the random samples (default 0)', {'default': 0}),
+        ('--seed', 'S', int, 'seed of the random samples (default 0)'),
         ('--cases', 'FILE.csv', Path,
          'CSV with a header of columns; each row is combined with the samples, and with the '
          'grids of the other columns'),
@@ -125,6 +125,9 @@ class _SweepPicture:
             self._paths = named(out, 'table', formats_of(arguments))
         self._tables = self._paper.tables(self._paths)
         if not self._paths:
+            for option, needed in given_with_needs(arguments):
+                if '--picture' in needed:
+                    raise BadInputError(f'{option} needs --picture or a folder as --out')
             return
         try:
             self._view = sweep.view()
@@ -187,6 +190,7 @@ def _sweep(arguments: argparse.Namespace) -> 'Sweep':
         system = InSI.of(
             values_of(read_parameter_file(path, entries), PLANNER, (*PLANNED, *VISCOELASTIC)),
             errors_of(known, ERRORS))
+        assume_options(arguments)
         if arguments.identified:
             belief = belief_of(known, path)
             if arguments.residual:
@@ -212,10 +216,10 @@ def _sweep(arguments: argparse.Namespace) -> 'Sweep':
     if spreads or belief.names:
         samples = draw(
             spreads, belief, 1024 if arguments.samples is None else arguments.samples,
-            arguments.seed)
-    elif arguments.samples is not None:
+            arguments.seed or 0)
+    elif without := [x for x in ('samples', 'seed') if getattr(arguments, x) is not None]:
         raise BadInputError(
-            '--samples is given without a random column: expected sobol:LOW:HIGH or '
+            f'--{without[0]} is given without a random column: expected sobol:LOW:HIGH or '
             'normal:MEAN:STD, or --identified')
     return Sweep(
         {name: x for name, x in values.items() if not isinstance(x, Spread)},
