@@ -1,24 +1,9 @@
-"""
-Hyperelastic models: a table, and one module for each model with its constants and source.
+"""Hyperelastic models of rubber, of measured curves and of beams, by name."""
 
-An energy is a function in Python (`hmsa.model.laws.formula`) or compiled in
-`hmsa/motion/hmsa/law.hpp`, where it is faster.
-"""
-
-from hmsa.model.laws import (
-    arruda_boyce,
-    beam,
-    extended_tube,
-    gent,
-    mooney_rivlin,
-    nonaffine,
-    ogden,
-    table,
-    yeoh,
-)
+from hmsa.model.laws import beam, rubber, table
 from hmsa.model.laws.record import Law
 
 #: Models by name; the first is the default.
 LAWS: dict[str, Law] = {x.name: x for x in (
-    gent.GENT, gent.NEO_HOOKEAN, mooney_rivlin.LAW, yeoh.LAW, ogden.LAW, arruda_boyce.LAW,
-    nonaffine.LAW, extended_tube.LAW, table.LAW, beam.LAW)}
+    rubber.GENT, rubber.NEO_HOOKEAN, rubber.MOONEY_RIVLIN, rubber.YEOH, rubber.OGDEN,
+    rubber.ARRUDA_BOYCE, rubber.NONAFFINE, rubber.EXTENDED_TUBE, table.LAW, beam.LAW)}
