@@ -24,6 +24,7 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from hmsa.api.facts import USUAL_MOVE
 from hmsa.errors import BadInputError, check_number
 from hmsa.interfaces.actuator import completed, model_from
 from hmsa.interfaces.parameters import LAW, LAW_NAME, ParameterSpec, PLANNED
@@ -34,7 +35,6 @@ from hmsa.model.mismatch import Errors, Uncertainty
 from hmsa.model.moves import Limits
 from hmsa.model.parameters import NondimensionalParameters
 from hmsa.model.units import NANOSECONDS, Units
-from hmsa.planning.scales import USUAL_MOVE
 from hmsa.planning.shapers.request import ERRORS
 
 if TYPE_CHECKING:

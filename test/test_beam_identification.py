@@ -30,7 +30,7 @@ from hmsa.identification.response import respond
 from hmsa.interfaces.actuator import along_elastica
 from hmsa.model import equations
 from hmsa.model.continuum import clamped
-from hmsa.model.laws.coordinate import DEFLECTION
+from hmsa.model.laws.record import DEFLECTION
 from hmsa.model.modes import Modes
 from hmsa.model.simulation import ActuatorSimulation
 

@@ -6,7 +6,7 @@ import pytest
 from hmsa.model.moves import State
 from hmsa.model.parameters import paper_actuator
 from hmsa.model.simulation import simulate
-from hmsa.planning.stopping import brake
+from hmsa.planning.drafting import brake
 from hmsa.planning.timeline import JointModel, Options
 
 

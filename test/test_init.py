@@ -12,13 +12,13 @@ import pytest
 import yaml
 
 from hmsa.api.actuator import Actuator
+from hmsa.api.facts import scales
 from hmsa.cli import main
 from hmsa.errors import BadInputError
 from hmsa.interfaces.quantities import BY_KEY, DAMPING, OPTIONAL, QUANTITIES, quantity_of
 from hmsa.model.equations import elastic_force, natural_frequency
 from hmsa.model.parameters import ActuatorParameters, NondimensionalParameters, paper_actuator
 from hmsa.model.simulation import simulate
-from hmsa.planning.scales import scales
 from hmsa.planning.two_step import plan_two_step
 
 ROOT = Path(__file__).resolve().parent.parent

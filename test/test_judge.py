@@ -8,10 +8,9 @@ from scipy.special import stdtrit
 
 from benchmarks.bench_judge import draw, verdict_of
 from hmsa.judge import _ringing
-from hmsa.judge.fit import fit
+from hmsa.judge.fit import fit, Stillness
 from hmsa.judge.judging import judge
 from hmsa.judge.records import missed, RequestedSetpoint, SensorModel, Tolerances, worst
-from hmsa.judge.stillness import Stillness
 
 MS = 1_000_000
 OMEGA, DECAY = 540.0, 54.0

@@ -21,7 +21,7 @@ from hmsa.api.arguments import (
     suggesting,
     whole,
 )
-from hmsa.api.facts import facts, unquestioned, warn
+from hmsa.api.facts import facts, Scales, scales, unquestioned, warn
 from hmsa.api.models import checked, DAMPED, limits_of, model_of, parameters_in
 from hmsa.errors import assume, BadInputError, check_choice, UnusualWarning
 from hmsa.files import write_text, yaml_text
@@ -39,7 +39,6 @@ from hmsa.model.equations import Array, critical_zeta, elastic_force, equilibriu
 from hmsa.model.mismatch import Uncertainty
 from hmsa.model.moves import Setpoint, State
 from hmsa.model.parameters import ActuatorParameters
-from hmsa.planning.scales import Scales, scales
 from hmsa.planning.sequence import plan_sequence
 from hmsa.planning.shapers import get_shaper
 from hmsa.planning.shapers.request import as_errors, ERRORS, MoveRequest, SmoothLimits

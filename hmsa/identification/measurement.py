@@ -13,7 +13,7 @@ from hmsa.errors import BadInputError, check_number
 from hmsa.interfaces.topics import PLANNER
 from hmsa.model.delivery import ramps
 from hmsa.model.equations import Array
-from hmsa.model.laws.coordinate import Coordinate, STRETCH
+from hmsa.model.laws.record import Coordinate, STRETCH
 from hmsa.model.moves import Level
 from hmsa.model.parameters import ActuatorParameters
 from hmsa.model.units import NANOSECONDS

@@ -5,7 +5,7 @@ import math
 from typing import NamedTuple
 
 from hmsa.errors import BadInputError
-from hmsa.model.laws.coordinate import DEFLECTION, STRETCH
+from hmsa.model.laws.record import DEFLECTION, STRETCH
 from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import Units
 

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from hmsa.errors import BadInputError
 from hmsa.model.creep import Creep
-from hmsa.model.laws.coordinate import Coordinate, coordinate_of
-from hmsa.model.laws.record import Elastic, ELASTICA
+from hmsa.model.laws.record import Coordinate, coordinate_of, Elastic, ELASTICA
 from hmsa.model.modes import Modes
 from hmsa.model.thermal import BLOCK_COEFFICIENTS, checked_temperature, Thermal
 from hmsa.model.units import MU_0, Units

@@ -35,8 +35,8 @@ from hmsa.model.simulation import (
 from hmsa.model.status import Code, RefusedError
 from hmsa.planning.sequence import TOLD
 from hmsa.planning.shapers.request import MoveRequest
+from hmsa.planning.shapers.shooting import Attempt, solve, Template, within_limits
 from hmsa.planning.shapers.two_step import two_step
-from hmsa.planning.shooting import Attempt, solve, Template, within_limits
 
 #: Stretch, rate and acceleration, shape (n,) each, at times from the start.
 Course = Callable[[Array], tuple[Array, Array, Array]]

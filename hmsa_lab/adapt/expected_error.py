@@ -23,7 +23,7 @@ import numpy as np
 from hmsa.errors import HmsaError
 from hmsa.identification.quantities import TEMPERATURE
 from hmsa.model.equations import Array
-from hmsa.model.laws.coordinate import coordinate_of
+from hmsa.model.laws.record import coordinate_of
 from hmsa.model.thermal import Thermal
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.planner import Planner

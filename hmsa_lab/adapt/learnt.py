@@ -21,7 +21,7 @@ from hmsa.identification.quantities import (
 )
 from hmsa.interfaces.actuator import parameters_of
 from hmsa.judge.records import SensorModel
-from hmsa.model.laws.coordinate import coordinate_of
+from hmsa.model.laws.record import coordinate_of
 from hmsa.planning.planner import Believed
 from hmsa.planning.timeline import JointModel
 from hmsa_lab.adapt.estimator import CREEPS, StateEstimate

@@ -23,7 +23,7 @@ from hmsa.identification.quantities import (
     WARMING,
 )
 from hmsa.model.equations import Array
-from hmsa.model.laws.coordinate import Coordinate, coordinate_of
+from hmsa.model.laws.record import Coordinate, coordinate_of
 from hmsa.model.modes import Modes
 from hmsa.model.parameters import ActuatorParameters
 from hmsa.model.thermal import BLOCK_COEFFICIENTS

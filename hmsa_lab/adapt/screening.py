@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmsa.model.equations import Array
-from hmsa.model.laws.coordinate import Coordinate
+from hmsa.model.laws.record import Coordinate
 
 # Number of rejected samples in a row that are no outliers: sensor or actuator has changed.
 _LOST = 6

@@ -19,7 +19,7 @@ from hmsa.identification.fit import loss, robust_scale, weights_of
 from hmsa.identification.quantities import complete, quantity_of, TEMPERATURE, values_at
 from hmsa.identification.response import gain_of, sensed
 from hmsa.model.equations import Array
-from hmsa.model.laws.coordinate import coordinate_of
+from hmsa.model.laws.record import coordinate_of
 from hmsa_lab.adapt.hypotheses import Evidence, GAIN, Hypotheses, inverse, optimum, Others
 from hmsa_lab.adapt.motion import follow, Levels, ModelMotion, rest
 from hmsa_lab.adapt.prior import SensorBefore

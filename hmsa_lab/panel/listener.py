@@ -21,7 +21,7 @@ from hmsa.files import finite
 from hmsa.interfaces import topics
 from hmsa.interfaces.status import real, StatusVerdict, texts, whole
 from hmsa.model.equations import Array
-from hmsa.model.laws.coordinate import COORDINATES, POSITION
+from hmsa.model.laws.record import COORDINATES, POSITION
 from hmsa.model.schedule import CommandSchedule
 from hmsa.model.units import flux_text, NANOSECONDS
 from hmsa_ros.nodes import ros_entities

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import math
 
 from hmsa.errors import BadInputError, HmsaError
-from hmsa.judge.stillness import Stillness
+from hmsa.judge.fit import Stillness
 from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.planner import Planner

@@ -5,9 +5,9 @@ import math
 
 from hmsa.model.moves import Move
 from hmsa.model.status import Code, RefusedError
-from hmsa.planning.shapers.free import free_levels
 from hmsa.planning.shapers.push_brake import push_brake
 from hmsa.planning.shapers.request import MoveRequest
+from hmsa.planning.shapers.shooting import free_levels
 from hmsa.planning.shapers.two_step import two_step
 
 # Work limit of the search for full push and full brake.

@@ -26,10 +26,16 @@ from hmsa.model.moves import Level, Move, State
 from hmsa.model.parameters import NondimensionalParameters
 from hmsa.model.simulation import followed_by
 from hmsa.model.status import Code, RefusedError
-from hmsa.planning.shapers.free import at_rest
 from hmsa.planning.shapers.request import AT_REST, MoveRequest
+from hmsa.planning.shapers.shooting import (
+    at_rest,
+    Attempt,
+    heights,
+    solve,
+    Template,
+    within_limits,
+)
 from hmsa.planning.shapers.two_step import two_step
-from hmsa.planning.shooting import Attempt, heights, solve, Template, within_limits
 
 # Durations to try, in units of the wanted one: near solutions that swing back and forth there are
 # others without (benchmarks continuum).

@@ -12,12 +12,13 @@ from hmsa.model import law
 from hmsa.model.moves import Level, Move, State
 from hmsa.model.simulation import paces, sampled
 from hmsa.model.status import Code, RefusedError
-from hmsa.planning.shapers.free import at_rest, free_levels
 from hmsa.planning.shapers.request import MoveRequest
-from hmsa.planning.shooting import (
+from hmsa.planning.shapers.shooting import (
+    at_rest,
     Attempt,
     continuation,
     first_kept,
+    free_levels,
     heights,
     on_time,
     solve,

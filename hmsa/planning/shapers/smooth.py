@@ -21,9 +21,8 @@ from hmsa.model.equations import acceleration, Array, elastic_force
 from hmsa.model.moves import Level, Move
 from hmsa.model.simulation import branches_of, fade, held_along, loads_for, sampled
 from hmsa.model.status import Code, RefusedError
-from hmsa.planning.shapers.free import at_rest
 from hmsa.planning.shapers.request import MOST_PERIODS, MoveRequest
-from hmsa.planning.shooting import Attempt, solve, Template, within_limits
+from hmsa.planning.shapers.shooting import at_rest, Attempt, solve, Template, within_limits
 
 # Points of a path, levels per natural period, and minimum and maximum number of levels.
 _POINTS = 129

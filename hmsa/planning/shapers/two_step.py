@@ -12,14 +12,17 @@ from hmsa import motion
 from hmsa.model.moves import Level, Move
 from hmsa.model.simulation import branches_of
 from hmsa.model.status import Code, RefusedError
-from hmsa.planning.shapers.free import at_rest, free_heights, free_levels, no_single
 from hmsa.planning.shapers.push_brake import push_brake
 from hmsa.planning.shapers.request import MoveRequest
-from hmsa.planning.shooting import (
+from hmsa.planning.shapers.shooting import (
+    at_rest,
     Attempt,
     continuation,
     first_kept,
+    free_heights,
+    free_levels,
     heights,
+    no_single,
     solve,
     soonest_kept,
     Template,
