@@ -18,8 +18,7 @@ from hmsa.model.equations import (
     stretch_limits,
 )
 from hmsa.model.parameters import NondimensionalParameters
-from hmsa.model.residual import residual_vibration
-from hmsa.model.simulation import simulate
+from hmsa.model.simulation import residual_vibration, simulate
 from hmsa.planning.two_step import CODES, Groups, plan_two_step, plan_two_step_batch
 from hmsa_studies import paper_data
 from hmsa_studies.paper_data import PaperResponse

@@ -22,10 +22,10 @@ from benchmarks.damped_sampled import (
 from hmsa.errors import complain, HmsaError
 from hmsa.model.moves import State
 from hmsa.model.parameters import NondimensionalParameters
-from hmsa.model.residual import percent
 from hmsa.planning.shapers import SHAPERS
 from hmsa.planning.shapers.request import MoveRequest, SmoothLimits
 from hmsa.report.looks import SCREEN
+from hmsa.table import percent
 from hmsa_studies.pictures import draw_front, draw_robustness
 from hmsa_studies.residual import Actual, Errors
 from hmsa_studies.robustness import Candidate, candidates, Case, PARAMETERS, Result, study

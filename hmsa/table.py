@@ -14,6 +14,22 @@ from hmsa.errors import BadInputError, check_choice
 #: Heading of the standard deviation of the column before.
 DEVIATION = '±'
 _GAP = '  '
+#: Smaller fractions of a step are not distinguished: no sensor resolves them.
+RESOLVED = 1e-5
+
+
+def percent(share: float, sign: str = '') -> str:
+    """
+    Format a fraction of a step in percent, without the unit; NaN gives a question mark.
+
+    Values below `RESOLVED` are shown as ``<``; with ``sign`` ``'+'`` others have a sign.
+    """
+    if math.isnan(share):
+        return '?'
+    if abs(share) < RESOLVED:
+        return f'<{100.0 * RESOLVED:g}'
+    value, size = 100.0 * share, 100.0 * abs(share)
+    return f'{value:{sign}.{1 if size >= 1.0 else 2 if size >= 0.1 else 3}f}'
 
 
 @dataclass(frozen=True)
@@ -40,8 +56,6 @@ class Column:
         if math.isinf(value):
             return '∞' if value > 0.0 else '-∞'
         if self.form.endswith('%'):
-            from hmsa.model.residual import percent  # imports NumPy
-
             return percent(0.01 * value, self.form[:-1])
         return f'{value:{self.form}}'
 

@@ -7,9 +7,9 @@ from pathlib import Path
 from matplotlib.axes import Axes
 import numpy as np
 
-from hmsa.model.residual import percent
 from hmsa.report import looks, style
 from hmsa.report.looks import LineStyle, Paper
+from hmsa.table import percent
 from hmsa_studies.robustness import Candidate, Case, ORDERED, Result
 
 # Smaller residuals are drawn at this value.

@@ -17,8 +17,7 @@ from hmsa.model.equations import (
 from hmsa.model.mismatch import Errors
 from hmsa.model.moves import Level, Move, State
 from hmsa.model.parameters import NondimensionalParameters
-from hmsa.model.residual import residual_vibration
-from hmsa.model.simulation import sampled
+from hmsa.model.simulation import residual_vibration, sampled
 from hmsa.model.status import Code
 from hmsa.motion import STRETCH
 from hmsa.planning.two_step import plan_two_step

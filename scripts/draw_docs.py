@@ -33,7 +33,7 @@ from benchmarks.robustness import PICTURES as STUDIES  # noqa: E402
 from benchmarks.warming import SILICONE  # noqa: E402
 from hmsa import Actuator  # noqa: E402
 from hmsa.interfaces.actuator import actuator_from  # noqa: E402
-from hmsa.interfaces.outcome import Outcome  # noqa: E402
+from hmsa.interfaces.diagnostics import Outcome  # noqa: E402
 from hmsa.interfaces.parameters import BLOCK  # noqa: E402
 from hmsa.model.compressible import condensed  # noqa: E402
 from hmsa.model.continuum import mode_shapes, spectrum  # noqa: E402

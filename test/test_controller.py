@@ -9,7 +9,7 @@ import pytest
 from std_msgs.msg import Float64
 
 from hmsa.interfaces import topics
-from hmsa.interfaces.status import texts
+from hmsa.interfaces.diagnostics import texts
 from hmsa_ros.nodes import conversions
 from hmsa_ros.nodes.controller import Cycles
 

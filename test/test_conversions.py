@@ -12,7 +12,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from hmsa.errors import BadInputError
-from hmsa.interfaces.status import StatusVerdict, whole
+from hmsa.interfaces.diagnostics import StatusVerdict, whole
 from hmsa.judge.records import Finding, missed, RequestedSetpoint, unobserved
 from hmsa.model.parameters import paper_actuator
 from hmsa.model.status import Code, RefusedError

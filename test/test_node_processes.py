@@ -14,7 +14,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from hmsa.cli import main
 from hmsa.interfaces import topics
-from hmsa.model.residual import residual_vibration
+from hmsa.model.simulation import residual_vibration
 from hmsa_ros.nodes.conversions import from_time, to_trajectory
 
 pytestmark = pytest.mark.ros

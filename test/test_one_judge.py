@@ -11,7 +11,7 @@ from at_work import AtWork, MS, planner, START
 import numpy as np
 import pytest
 
-from hmsa.interfaces.outcome import newest, Outcome
+from hmsa.interfaces.diagnostics import newest, Outcome
 from hmsa.judge.records import SensorModel
 from hmsa.model.actuators import Setup
 from hmsa.model.parameters import paper_actuator

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from hmsa.interfaces.outcome import newest, Outcome
+from hmsa.interfaces.diagnostics import newest, Outcome
 from hmsa.model.actuators import Setup
 from hmsa.model.parameters import paper_actuator
 from hmsa.planning.group import PlannerGroup

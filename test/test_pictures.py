@@ -17,13 +17,13 @@ from test_report import ACTUATOR, one, parameters, simulated
 from hmsa import Actuator
 from hmsa.errors import BadInputError
 from hmsa.interfaces.topics import FLUX_DENSITY_COMMAND
-from hmsa.model.residual import percent
 from hmsa.report import style
 from hmsa.report.charts import commanded, PANELS
 from hmsa.report.comparison import Part
 from hmsa.report.figures import decimate, through, TimeCurve
 from hmsa.report.looks import case, CASES, KINDS, LineStyle, named, Paper, SHAPERS
 from hmsa.report.picture import draw, draw_bands
+from hmsa.table import percent
 from hmsa_studies.sweep_pictures import label_of, worded
 
 # What deuteranopia and protanopia leave of linear red, green and blue (Machado and others, IEEE

@@ -14,8 +14,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from hmsa.interfaces import topics
 from hmsa.model.parameters import paper_actuator
-from hmsa.model.residual import residual_vibration
-from hmsa.model.simulation import simulate
+from hmsa.model.simulation import residual_vibration, simulate
 from hmsa.planning.planner import Options, Planner
 from hmsa_ros.nodes.conversions import from_time, to_clock, to_command
 from hmsa_ros.nodes.plant import PlantNode

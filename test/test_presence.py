@@ -9,7 +9,7 @@ from std_srvs.srv import Trigger
 
 from hmsa.cli import main
 from hmsa.interfaces import topics
-from hmsa.interfaces.status import StatusVerdict
+from hmsa.interfaces.diagnostics import StatusVerdict
 from hmsa_lab.panel.listener import Listener
 from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.conversions import to_trajectory

@@ -25,13 +25,12 @@ from hmsa.cli import main
 from hmsa.errors import BadInputError
 from hmsa.identification.measurement import recording_of
 from hmsa.interfaces.actuator import parameters_of
-from hmsa.interfaces.outcome import Outcome
+from hmsa.interfaces.diagnostics import Outcome
 from hmsa.interfaces.parameters import ACTUATOR_FIELDS
 from hmsa.judge.records import Tolerances
 from hmsa.model.creep import Creep
 from hmsa.model.parameters import NondimensionalParameters, paper_actuator
-from hmsa.model.residual import percent, residual_vibration
-from hmsa.model.simulation import ActuatorSimulation, simulate
+from hmsa.model.simulation import ActuatorSimulation, residual_vibration, simulate
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.planner import Options, Planner
 from hmsa.report.charts import MOST_PANELS
@@ -44,6 +43,7 @@ from hmsa.runs.bags import read_run, read_runs
 from hmsa.runs.record import described, in_force, RecordedLevel, without_repeats
 from hmsa.runs.topics import APPLIED, COMMAND, JOINT_STATES, OUTCOMES, PLAN, STATUS, TYPES
 from hmsa.runs.verify import verify
+from hmsa.table import percent
 
 rosbag2, typesys = needs('rosbags.rosbag2'), needs('rosbags.typesys')
 STORE = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)

@@ -22,8 +22,7 @@ from hmsa.model.simulation import ActuatorSimulation
 from hmsa.model.units import NANOSECONDS
 from hmsa.runs import bags
 from hmsa.runs.parameters import actuators, read_parameter_file, recorded, values_of
-from hmsa.runs.record import lateness_of, RecordedLevel, Run
-from hmsa.runs.tables import levels_of, samples_of, write_table
+from hmsa.runs.record import lateness_of, levels_of, RecordedLevel, Run, samples_of, write_table
 from hmsa.runs.topics import APPLIED, COMMAND
 from hmsa.runs.verify import verify_run
 

@@ -8,7 +8,7 @@ import pytest
 from test_runtime_hosts import BEATING, Bench
 from test_runtime_planner import HOLD, MS, QUIET, Rig, SEQUENCE, START, trajectory
 
-from hmsa.interfaces.status import StatusVerdict
+from hmsa.interfaces.diagnostics import StatusVerdict
 from hmsa_ros.nodes.conversions import to_planner_status
 from hmsa_ros.runtime.records import Severity, StatusChanged, Stop, StretchRequest
 

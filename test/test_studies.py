@@ -32,9 +32,9 @@ from hmsa.model.equations import (
 )
 from hmsa.model.moves import Level, Limits, Move
 from hmsa.model.parameters import ActuatorParameters, NondimensionalParameters, paper_actuator
-from hmsa.model.residual import percent
 from hmsa.model.status import Code
 from hmsa.planning.two_step import plan_two_step
+from hmsa.table import percent
 from hmsa_studies.axes import MOST_VALUES, parse_grid, read_cases
 from hmsa_studies.pictures import draw_front, draw_robustness
 from hmsa_studies.residual import Actual, arrival_of, Errors

@@ -8,7 +8,7 @@ from sensor_msgs.msg import Temperature
 from std_msgs.msg import Float64
 
 from hmsa.interfaces import topics
-from hmsa.interfaces.status import texts
+from hmsa.interfaces.diagnostics import texts
 from hmsa.model.actuators import Setup
 from hmsa.model.parameters import paper_actuator
 from hmsa.model.thermal import Thermal

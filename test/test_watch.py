@@ -10,7 +10,7 @@ import signal
 import numpy as np
 import pytest
 
-from hmsa.interfaces.status import StatusVerdict
+from hmsa.interfaces.diagnostics import StatusVerdict
 from hmsa_lab.panel.listener import as_json, JointView, line, PeakHistory, Report, Scene, SLOTS
 
 WAIT_SECONDS = 60.0

@@ -11,18 +11,22 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hmsa.api.arguments import (
+    checked,
     columns_of,
+    DAMPED,
     file_of,
     grid_of,
+    limits_of,
     mapping_of,
+    model_of,
     number,
     numbers,
+    parameters_in,
     setpoints_of,
     suggesting,
     whole,
 )
 from hmsa.api.facts import facts, Scales, scales, unquestioned, warn
-from hmsa.api.models import checked, DAMPED, limits_of, model_of, parameters_in
 from hmsa.errors import assume, BadInputError, check_choice, UnusualWarning
 from hmsa.files import write_text, yaml_text
 from hmsa.interfaces.actuator import parameters_of, planned_from
@@ -812,7 +816,7 @@ class Actuator:
         [1.65, 1.98, 2.97]
 
         """
-        from hmsa.api.amplifier import amplifiers
+        from hmsa.api.plan import amplifiers
 
         return amplifiers(self, setpoints, **more)
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hmsa.api.models import CLAMPED, clamped_beam
+from hmsa.api.arguments import CLAMPED, clamped_beam
 from hmsa.errors import assume, BadInputError, UnusualWarning
 from hmsa.interfaces.actuator import actuator_from, parameters_of
 from hmsa.interfaces.quantities import FORMS

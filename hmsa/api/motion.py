@@ -10,12 +10,20 @@ import numpy as np
 
 from hmsa.api.arguments import file_of, number, several, suggesting, whole
 from hmsa.errors import BadInputError, check_choice, excerpt, meant
-from hmsa.interfaces.outcome import Outcome
+from hmsa.interfaces.diagnostics import Outcome
 from hmsa.model.equations import Array
 from hmsa.model.simulation import longest_motion, response
 from hmsa.model.units import NANOSECONDS
-from hmsa.runs.record import described, read_only, RecordedLevel, Run
-from hmsa.runs.tables import levels_of, samples_of, UNITS, write_run
+from hmsa.runs.record import (
+    described,
+    levels_of,
+    read_only,
+    RecordedLevel,
+    Run,
+    samples_of,
+    UNITS,
+    write_run,
+)
 from hmsa.table import dataset, frame, Table
 
 if TYPE_CHECKING:

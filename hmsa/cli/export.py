@@ -30,7 +30,7 @@ def add_parser(subparsers: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Read and write."""
     from hmsa.runs.bags import read_run
-    from hmsa.runs.tables import write_run
+    from hmsa.runs.record import write_run
 
     with progress() as update:
         found = read_run(arguments.run_path, joint=arguments.joint, progress=update)

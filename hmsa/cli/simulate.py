@@ -40,7 +40,7 @@ def add_parser(subparsers: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Simulate, write and print."""
-    from hmsa.runs.tables import levels_beside
+    from hmsa.runs.record import levels_beside
 
     out: Path | None = arguments.out
     paper = paper_of(

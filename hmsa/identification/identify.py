@@ -41,7 +41,7 @@ from hmsa.identification.search import rivals, search, unmoved
 from hmsa.interfaces.actuator import along_elastica, parameters_of
 from hmsa.model.equations import Array
 from hmsa.model.parameters import ActuatorParameters, paper_actuator
-from hmsa.model.residual import RESOLVED
+from hmsa.table import RESOLVED
 
 # Maximum number of iterations for the timestamp errors.
 _MOST_SPREADS = 3

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from hmsa.errors import BadInputError
-from hmsa.interfaces.outcome import LEVELS
+from hmsa.interfaces.diagnostics import LEVELS
 from hmsa.model.equations import Array, natural_frequency
 from hmsa.model.modes import Modes, MOST
 from hmsa.model.parameters import ActuatorParameters

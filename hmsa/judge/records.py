@@ -5,9 +5,9 @@ from dataclasses import asdict, dataclass, fields
 from functools import cached_property
 import math
 
-from hmsa.model.residual import percent, RESOLVED
 from hmsa.model.status import Code
 from hmsa.model.units import NANOSECONDS
+from hmsa.table import percent, RESOLVED
 
 #: Verdicts on a setpoint, from best to worst.
 VERDICTS = (

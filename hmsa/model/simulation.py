@@ -412,3 +412,22 @@ def held_along(
     if not motion.trail(times, forces, with_followed(material, followed), behind):
         raise HmsaError(STUCK)
     return (forces[:, np.newaxis] - behind) @ material.branches[:, motion.RATIO], behind
+
+
+def residual_vibration(
+        time: ArrayLike, stretch: ArrayLike, *, arrival: float, end: float,
+        step: float) -> float:
+    """
+    Return the peak-to-peak stretch after arrival as a fraction (not percent) of the step.
+
+    Samples from ``arrival`` to ``end``, both included, count; ``time`` (n,) increases, in the same
+    unit. Raise `HmsaError` for fewer than two of them, or a step of zero. 0 means rest.
+    """
+    time = np.asarray(time, dtype=np.float64)
+    inside = (time >= arrival) & (time <= end)
+    count = int(np.count_nonzero(inside))
+    if count < 2 or step == 0.0:
+        raise HmsaError(
+            f'{count} samples between {arrival:g} and {end:g} after a step of {step:g}: '
+            'expected at least two samples and a step')
+    return float(np.ptp(np.asarray(stretch, dtype=np.float64)[inside]) / abs(step))

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 
 from hmsa.model.equations import Array, elastic_force
-from hmsa.model.residual import RESOLVED
 from hmsa.report import looks
 from hmsa.report.comparison import around, left_text, Part, results_of, span, worst
 from hmsa.report.figures import Axis, Curve, decimate, Panel, TimeCurve
 from hmsa.report.looks import BLACK, BLUE, LineStyle, VERMILION
 from hmsa.runs.record import held_at
+from hmsa.table import RESOLVED
 
 #: Maximum number of setpoints with a panel of their own in a page.
 MOST_PANELS = 12

@@ -11,7 +11,6 @@ import numpy as np
 from hmsa.errors import BadInputError
 from hmsa.judge.records import Finding, Tolerances
 from hmsa.model.equations import Array
-from hmsa.model.residual import percent
 from hmsa.model.units import NANOSECONDS
 from hmsa.report.evaluation import (
     evaluate,
@@ -24,7 +23,7 @@ from hmsa.report.evaluation import (
 )
 from hmsa.report.figures import TimeCurve
 from hmsa.runs.record import lateness_of, RecordedLevel, Run, Times, without_repeats
-from hmsa.table import Column, DEVIATION, Table
+from hmsa.table import Column, DEVIATION, percent, Table
 
 # A change of level that took effect within this time in s of its timestamp was on time: the clock
 # of a board with a schedule of its own is known to a few us.

@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from hmsa.errors import HmsaError
-from hmsa.interfaces.outcome import Outcome
+from hmsa.interfaces.diagnostics import Outcome
 from hmsa.interfaces.parameters import number_of
 from hmsa.interfaces.topics import PLANNER
 from hmsa.judge.records import Finding, RequestedSetpoint, SensorModel, Tolerances, unobserved
@@ -27,8 +27,7 @@ from hmsa.model.equations import (
 from hmsa.model.moves import Level as PlannedLoad
 from hmsa.model.moves import State
 from hmsa.model.parameters import ActuatorParameters
-from hmsa.model.residual import residual_vibration
-from hmsa.model.simulation import follow, response, sampled
+from hmsa.model.simulation import follow, residual_vibration, response, sampled
 from hmsa.model.status import Code
 from hmsa.model.units import NANOSECONDS
 from hmsa.report.figures import fine, through, TimeCurve

@@ -20,7 +20,6 @@ from hmsa.interfaces.actuator import parameters_of
 from hmsa.interfaces.parameters import ACTUATOR, ACTUATOR_FIELDS, LAW
 from hmsa.model.equations import critical_zeta, stretch_limits
 from hmsa.model.parameters import ActuatorParameters
-from hmsa.model.residual import percent
 from hmsa.model.units import NANOSECONDS
 from hmsa.report import charts, looks
 from hmsa.report.charts import TimeUnit
@@ -29,7 +28,7 @@ from hmsa.report.evaluation import FEW_SAMPLES, plan_points, verdict_on
 from hmsa.report.figures import BUCKETS, Figure
 from hmsa.runs.record import Run
 from hmsa.runs.topics import APPLIED
-from hmsa.table import Column, Table
+from hmsa.table import Column, percent, Table
 
 #: Folder of the templates.
 FOLDER = Path(__file__).parent

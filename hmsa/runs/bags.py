@@ -20,7 +20,7 @@ from hmsa.bag import limits
 from hmsa.bag.info import BagSummary, summarize
 from hmsa.bag.reader import BagReader, Message
 from hmsa.errors import assume, BadInputError, BagError, meant, MissingWarning
-from hmsa.interfaces.outcome import newest, Outcome
+from hmsa.interfaces.diagnostics import newest, Outcome
 from hmsa.interfaces.parameters import JOINT
 from hmsa.judge.records import SensorModel
 from hmsa.model.schedule import is_axial_field

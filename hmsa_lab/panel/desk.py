@@ -23,7 +23,7 @@ from hmsa.ending import ENDING
 from hmsa.errors import BadInputError, HmsaError, printable
 from hmsa.files import finite
 from hmsa.interfaces import topics
-from hmsa.interfaces.status import real, texts
+from hmsa.interfaces.diagnostics import real, texts
 from hmsa.interfaces.topics import DRIVER, INTERLOCK, RECORDER
 from hmsa_lab.panel.listener import as_json, LEVELS, Listener, PeakHistory, Scene, SLOTS
 from hmsa_lab.panel.server import Server

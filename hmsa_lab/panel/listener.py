@@ -19,7 +19,7 @@ from sensor_msgs.msg import JointState
 from hmsa.errors import BadInputError, printable
 from hmsa.files import finite
 from hmsa.interfaces import topics
-from hmsa.interfaces.status import real, StatusVerdict, texts, whole
+from hmsa.interfaces.diagnostics import real, StatusVerdict, texts, whole
 from hmsa.model.equations import Array
 from hmsa.model.laws.record import COORDINATES, POSITION
 from hmsa.model.schedule import CommandSchedule

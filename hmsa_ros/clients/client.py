@@ -18,7 +18,7 @@ from hmsa.cli.terminal import under_way
 from hmsa.ending import ENDING
 from hmsa.errors import BadInputError, HmsaError
 from hmsa.interfaces import topics
-from hmsa.interfaces.status import StatusVerdict
+from hmsa.interfaces.diagnostics import StatusVerdict
 from hmsa.model.status import Code
 from hmsa.model.units import NANOSECONDS
 from hmsa_ros.clients.experiment import check_stretches

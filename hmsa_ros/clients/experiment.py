@@ -20,8 +20,8 @@ from hmsa.errors import BadInputError, HmsaError
 from hmsa.files import make_folder
 from hmsa.interfaces import topics
 from hmsa.interfaces.actuator import actuator_from
+from hmsa.interfaces.diagnostics import StatusVerdict
 from hmsa.interfaces.parameters import BLOCK
-from hmsa.interfaces.status import StatusVerdict
 from hmsa.interfaces.topics import PLANNER, PLANT
 from hmsa.runs.parameters import values_of
 from hmsa_ros.clients.processes import NodeProcess, Session

@@ -9,8 +9,8 @@ from std_srvs.srv import SetBool
 
 from hmsa.errors import BadInputError, HmsaError
 from hmsa.interfaces import topics
+from hmsa.interfaces.diagnostics import whole
 from hmsa.interfaces.parameters import BLOCK, WORDS
-from hmsa.interfaces.status import whole
 from hmsa_ros.clients.client import newest_time, PlannerClient
 from hmsa_ros.clients.experiment import Experiment, START_SECONDS
 from hmsa_ros.clients.remote import remote_parameters

@@ -17,7 +17,7 @@ from hmsa.cli.terminal import under_way
 from hmsa.ending import ENDING
 from hmsa.errors import HmsaError
 from hmsa.interfaces import topics
-from hmsa.interfaces.status import StatusVerdict
+from hmsa.interfaces.diagnostics import StatusVerdict
 from hmsa.model.status import Code
 from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.temporary_node import SLICE_SECONDS, TemporaryNode

@@ -18,7 +18,7 @@ from hmsa.model.units import NANOSECONDS
 
 if TYPE_CHECKING:
     # Imported with the planner, which a recorder does not need.
-    from hmsa.interfaces.outcome import Outcome
+    from hmsa.interfaces.diagnostics import Outcome
     from hmsa_ros.runtime.records import StatusChanged
 
 #: Contents of a receipt while commands from before a cut-off, or all commands, are rejected, and

@@ -19,7 +19,7 @@ from std_msgs.msg import Float64
 from hmsa.errors import BadInputError, BagError
 from hmsa.interfaces import topics
 from hmsa.interfaces.actuator import actuator_from
-from hmsa.interfaces.outcome import Outcome
+from hmsa.interfaces.diagnostics import Outcome
 from hmsa.model.actuators import unheld
 from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import NANOSECONDS

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
-from hmsa.interfaces.outcome import LEVELS, Outcome, PATH, REPLACED, SETPOINT, STOPPED
+from hmsa.interfaces.diagnostics import LEVELS, Outcome, PATH, REPLACED, SETPOINT, STOPPED
 from hmsa.judge.records import (
     Finding,
     GoalTolerances,

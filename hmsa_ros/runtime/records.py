@@ -6,7 +6,7 @@ from enum import IntEnum
 from typing import Any, NamedTuple, TYPE_CHECKING
 
 from hmsa.errors import check_number, excerpt
-from hmsa.interfaces.outcome import Outcome
+from hmsa.interfaces.diagnostics import Outcome
 from hmsa.judge.records import Finding, GoalTolerances, Tolerances
 from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import NANOSECONDS

@@ -218,7 +218,7 @@ def _print_table(case: 'Case', results: 'list[Result]', unit: float | None) -> N
     from rich.console import Console
     from rich.table import Table
 
-    from hmsa.model.residual import percent
+    from hmsa.table import percent
 
     error = f'{100.0 * case.box:g}'
     table = Table(
