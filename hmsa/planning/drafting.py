@@ -26,8 +26,14 @@ from hmsa.planning.sequence import Segment, segments
 from hmsa.planning.shapers import SHAPERS
 from hmsa.planning.shapers.request import MoveRequest, Shaper
 from hmsa.planning.shapers.shooting import through
-from hmsa.planning.timeline import Draft, JointModel, PlannedLevel, PlannedSegment, Timeline
-from hmsa.planning.warmth import Warmth
+from hmsa.planning.timeline import (
+    Draft,
+    JointModel,
+    PlannedLevel,
+    PlannedSegment,
+    Timeline,
+    Warmth,
+)
 
 # Stretch rates below this fraction of the natural frequency are rounding errors.
 _AT_REST = 1e-6

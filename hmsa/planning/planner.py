@@ -22,8 +22,7 @@ from hmsa.planning import Check, drafting, proceed
 from hmsa.planning.drafting import PathPoint, PlanStart
 from hmsa.planning.given_levels import check_levels, draft_levels
 from hmsa.planning.running import RunningPlan
-from hmsa.planning.timeline import Draft, JointModel, Options, PlannedLevel, Timeline
-from hmsa.planning.warmth import Warmth
+from hmsa.planning.timeline import Draft, JointModel, Options, PlannedLevel, Timeline, Warmth
 
 __all__ = ['Options', 'Planner']
 
