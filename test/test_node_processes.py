@@ -200,11 +200,24 @@ def test_nodes_import_nothing_while_they_move_an_actuator_and_judge(ros, start):
 
 
 def test_a_planner_imports_what_new_settings_need_beside_its_loop(ros, start):
-    planner = start.python('-c', LATE_IMPORTS, 'planner')
-    for name, value in (('trajectory_mode', 'path'), ('feedback', 'observe')):
+    points = [(1.0 + 0.1 * k, 0.03 * k) for k in range(-3, 5)]
+    stretch, flux_density = (list(x) for x in zip(*points, strict=True))
+    planner = start.python(
+        '-c', LATE_IMPORTS, 'planner', '--ros-args', '-p', f'law.stretch:={stretch}',
+        '-p', f'law.flux_density:={flux_density}')
+    for name, value in (
+            ('trajectory_mode', 'path'), ('feedback', 'observe'), ('law.name', 'table')):
         result, = ros.set_parameters('planner', [Parameter(name, value=value)])
-        assert result.successful
+        assert result.successful, result.reason
     ros.spin_until(lambda: ros.call(Trigger, 'planner/reset_estimate').success, 'feedback')
+    assert planner.stop() == 0
+    assert 'late import' not in planner.stdout
+
+
+def test_a_planner_refuses_a_law_without_its_table_before_it_imports_anything(ros, start):
+    planner = start.python('-c', LATE_IMPORTS, 'planner')
+    result, = ros.set_parameters('planner', [Parameter('law.name', value='table')])
+    assert 'has neither law.file nor points' in result.reason
     assert planner.stop() == 0
     assert 'late import' not in planner.stdout
 

@@ -24,9 +24,9 @@ def _completed(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _scaled(values: Mapping[str, Any]) -> tuple[float, Elastic]:
-    from hmsa.model.laws import curve
-
     values = {**values, **_completed(values)}
+    from hmsa.model.laws import curve  # after the check: a planner may check this in its loop
+
     stretch, flux = tuple(values[_STRETCH]), tuple(values[_FLUX])
     found = curve.fitted(stretch, flux)
     # psi'' is 3 at rest, in units of G, for all models.
