@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+import errno
 import json
 import os
 from pathlib import Path
@@ -166,6 +167,17 @@ def test_a_writer_that_cannot_write_at_the_end_says_so(tmp_path):
     status = recording.close()
     assert status.error
     assert sum(lost_by_topic(status.overflowed, status.dropped).values()) == 10
+
+
+def test_a_bag_that_finds_no_room_leaves_no_folder_in_the_way_of_the_next(tmp_path, monkeypatch):
+    def full(_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(BagWriter, '_open', full)
+        with pytest.raises(BadInputError, match='cannot be made .No space left'):
+            BagWriter(tmp_path / 'bag')
+    BagWriter(tmp_path / 'bag').close()
 
 
 def test_after_the_end_nothing_more_is_done(tmp_path):

@@ -110,6 +110,8 @@ class BagWriter:
                 f'{self.folder} exists: expected the name of a new bag; choose another name or '
                 'remove it') from None
         except OSError as error:
+            with contextlib.suppress(OSError):
+                self.folder.rmdir()  # else the next attempt would find it
             raise BadInputError(
                 f'{self.folder} cannot be made ({error.strerror}): expected a folder with space '
                 'that can be written to') from error
