@@ -14,6 +14,7 @@ from hmsa.runs.bags import read_runs
 from hmsa.runs.record import without_repeats
 from hmsa_ros.cli.run import _carried_out
 from hmsa_ros.clients.experiment import Experiment
+from hmsa_ros.clients.processes import Session
 
 RUN_SECONDS = 300.0
 SETPOINTS = ('1.10:0.1', '1.20:0.1', '1.00:0.1')
@@ -239,3 +240,12 @@ def test_the_evaluation_of_a_run_can_be_interrupted(handlers, monkeypatch, tmp_p
     ENDING.note()
     with pytest.raises(KeyboardInterrupt):
         _carried_out(SimpleNamespace(report=False), experiment, None, lambda *_: None)
+
+
+def test_a_node_that_could_not_write_its_log_ends_with_the_full_disk_as_the_reason(
+        tmp_path, monkeypatch):
+    session = Session(tmp_path)
+    session.log('recorder').touch()
+    assert session.last_words('recorder').startswith('it printed nothing (log: ')
+    monkeypatch.setattr('shutil.disk_usage', lambda _: SimpleNamespace(free=0))
+    assert session.last_words('recorder').startswith(f'the disk of {tmp_path} is full (log: ')

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from datetime import datetime
 import os
 from pathlib import Path
+import shutil
 import signal
 import subprocess
 import sys
@@ -18,6 +19,8 @@ from hmsa_ros.middleware import RANGE
 _PR_SET_PDEATHSIG = 1
 # Enough for a recorder to write its messages to a slow disk.
 _PATIENCE_SECONDS = 15.0
+# Free bytes of a disk below which a node cannot write its log: a block.
+_ROOM = 4096
 
 
 @dataclass(frozen=True)
@@ -100,7 +103,9 @@ class Session:
     def last_words(self, name: str) -> str:
         """Return the last line of a node's log, with the path of the log."""
         lines = self.log(name).read_text(errors='replace').strip().splitlines()
-        return f'{lines[-1] if lines else "it printed nothing"} (log: {self.log(name)})'
+        full = shutil.disk_usage(self._folder).free < _ROOM
+        said = f'the disk of {self._folder} is full' if full else 'it printed nothing'
+        return f'{lines[-1] if lines else said} (log: {self.log(name)})'
 
     def stop(self) -> dict[str, int]:
         """End the recorder, then all other nodes together; return exit statuses by node."""
