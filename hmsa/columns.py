@@ -18,6 +18,7 @@ Array = NDArray[np.float64]
 
 _SEPARATORS = (';', '\t', ',', '|')
 _STRONGEST = 5.0  # maximum flux density of a coil in T
+_UNUSUAL = 100.0  # current of a coil in A above which a column without a unit may be in mA
 _LARGEST_FILE = 512 * 1024 * 1024
 # The first unit of each quantity is the default.
 _UNITS = {
@@ -190,6 +191,13 @@ def read_table(
                     'expected a number'
                     + (_decimal_commas(separator) if ',' in parts[place.index] else ''))
             columns[name][i] = value * factors[name]
+    if 'current' in places and not (places['current'].unit or below.get('current')):
+        most = float(np.nanmax(np.abs(columns['current']), initial=0.0))
+        if most > _UNUSUAL:
+            raise BadInputError(
+                f'{path} has currents up to {most:.6g} without a unit: expected at most '
+                f'{_UNUSUAL:g} A; write "current [mA]" in its header, or "current [A]" if they '
+                'are in A')
     for text, stated in _taken(path, places, factors, rest_length):
         if notes is not None:
             notes.append(text)

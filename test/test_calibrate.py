@@ -55,6 +55,32 @@ def test_readings_in_mt_without_a_unit_are_refused(tmp_path, capsys):
         CoilModel(file=str(source))
 
 
+def test_currents_in_ma_without_a_unit_are_refused_as_readings_and_by_the_driver(tmp_path, capsys):
+    source = tmp_path / 'readings.csv'
+
+    def write(unit, factor):
+        source.write_text(f'current{unit},flux_density\n' + ''.join(
+            f'{factor * x:g},{0.05 * x:g}\n' for x in (-2.0, -1.0, 0.0, 1.0, 2.0)))
+
+    write('', 1e3)
+    assert main(['calibrate', 'coil', str(source)]) == 2
+    assert 'has currents up to 2000 without a unit: expected' in capsys.readouterr().err
+    with pytest.raises(BadInputError, match=r'write "current \[mA\]" in its header, or "curr'):
+        CoilModel(file=str(source))
+    for unit, factor, current in ((' [mA]', 1e3, 1.0), ('', 1.0, 1.0), (' [A]', 1e3, 1000.0)):
+        write(unit, factor)
+        assert main(['calibrate', 'coil', str(source)]) == 0
+        assert CoilModel(file=str(source)).current(0.05) == pytest.approx(current)
+
+
+def test_a_missing_reading_is_refused_with_its_line(tmp_path, capsys):
+    source = tmp_path / 'readings.csv'
+    source.write_text('current,flux_density\n0,0\n1,\n2,0.1\n3,0.15\n')
+    assert main(['calibrate', 'coil', str(source)]) == 2
+    assert 'readings.csv line 3 has no number for current or flux_density' in (
+        capsys.readouterr().err)
+
+
 def test_a_coil_like_no_model_gets_a_table_that_the_driver_takes(tmp_path, capsys):
     source, out = tmp_path / 'readings.csv', tmp_path / 'coil.yaml'
     flux = 0.05 * LOOP + 0.02 * np.maximum(LOOP, 0.0)

@@ -138,7 +138,7 @@ def _coil(arguments: argparse.Namespace) -> int:
     if arguments.out is not None:
         if found.model == 'table':
             table = _write_table(arguments.out, {
-                'current': found.current, 'flux_density': found.flux_density})
+                'current [A]': found.current, 'flux_density [T]': found.flux_density})
         settings = found.settings(str(table and table.resolve()))
         if core is not None and arguments.hysteresis:
             settings |= {'hardware.coil.play_widths': list(core.widths),
@@ -175,7 +175,9 @@ def _readings(arguments: argparse.Namespace) -> 'tuple[Array, Array]':
             path.is_dir() and arguments.source not in registered(HARDWARE)):
         from hmsa.columns import check_flux_densities, read_table
 
-        columns = read_table(path, ('current', 'flux_density')).columns
+        table = read_table(path, ('current', 'flux_density'))
+        table.check_complete(path)
+        columns = table.columns
         check_flux_densities(path, columns['flux_density'])
         return columns['current'], columns['flux_density']
     import numpy as np
