@@ -16,7 +16,7 @@ import numpy as np
 from hmsa import motion
 from hmsa.errors import check_choice, HmsaError
 from hmsa.model import law
-from hmsa.model.delivery import Delivery, ramps
+from hmsa.model.delivery import ramps
 from hmsa.model.equations import Array, elastic_force, natural_frequency
 from hmsa.model.laws.record import ENDLESS
 from hmsa.model.moves import Level, Move, Setpoint, State
@@ -240,7 +240,7 @@ def segments(
     `RefusedError` if a setpoint cannot be reached, `BadInputError` if an argument is out of range.
     """
     shape = first or shaper
-    units, state = frame.units, frame.state
+    units, state, rounded = frame.units, frame.state, frame.delivery.rounded
     frame.material.check(state.stretch, 'start stretch')
     begin = 0.0
     upcoming = iter(setpoints)
@@ -248,7 +248,11 @@ def segments(
     while setpoint is not None:
         following = next(upcoming, None)
         request = replace(frame, state=state, target=setpoint.stretch, work=StepBudget())
-        move = _rounded(shape(request), frame.delivery)
+        move = shape(request)
+        # With times that commands can have.
+        move = Move(
+            move.code, tuple(Level(rounded(x.time), x.load) for x in move.levels),
+            rounded(move.duration), move.reason)
         if frame.material.creeps:
             move = creeping.held(
                 request, move, math.inf if following is None else setpoint.span)
@@ -283,13 +287,6 @@ def _cut(request: MoveRequest, move: Move, span: float, *, last: bool) -> Move:
         duration=move.duration if last else math.inf,
         reason=f'the duration {units.time_text(span)} ends before {request.named_target} is '
         f'reached, which takes {units.time_text(move.duration)}')
-
-
-def _rounded(move: Move, delivery: Delivery) -> Move:
-    """Return a move with times rounded to those that commands can have."""
-    return Move(
-        move.code, tuple(Level(delivery.rounded(x.time), x.load) for x in move.levels),
-        delivery.rounded(move.duration), move.reason)
 
 
 def _follow(request: MoveRequest, move: Move, span: float) -> State:
