@@ -234,6 +234,10 @@ class Receipts:
     def __bool__(self) -> bool:
         return bool(self.joints)
 
+    def _known(self, joint: str) -> _Receiver:
+        """Return the state of a joint's device; one that nothing is known of without receipts."""
+        return self.joints.get(joint) or _Receiver(0)
+
     def sent(self, joint: str, stamp: int, now: int, *, level: bool = False) -> None:
         """
         Record that a command was sent; timestamp and time in ns of the planner's clock.
@@ -251,8 +255,7 @@ class Receipts:
 
     def owed(self, joint: str) -> bool:
         """Return whether a joint's device has not acknowledged the newest level."""
-        known = self.joints.get(joint)
-        return known is not None and known.level is not None
+        return self._known(joint).level is not None
 
     def received(
             self, joint: str, time: int, command: int | None, now: int, *,
@@ -310,10 +313,9 @@ class Receipts:
 
     def void(self, joint: str) -> None:
         """Expect no acknowledgement of the commands sent so far, since they are rejected."""
-        known = self.joints.get(joint)
-        if known is not None:
-            known.clock.lost()
-            known.unanswered = known.level = None
+        known = self._known(joint)
+        known.clock.lost()
+        known.unanswered = known.level = None
 
     def since(self, joint: str, time: int) -> bool:
         """Return whether a joint's newest receipt is no older than a time of its device."""
@@ -353,9 +355,7 @@ class Receipts:
 
     def take_step(self, joint: str) -> int:
         """Return by how many ns a device's clock was set ahead since the last call."""
-        known = self.joints.get(joint)
-        if known is None:
-            return 0
+        known = self._known(joint)
         step, known.step = known.step, 0
         return step
 
@@ -411,18 +411,15 @@ class Receipts:
 
     def lag(self, joint: str) -> int | None:
         """Return the smallest age in ns of a joint's receipts at arrival; None for no receipt."""
-        known = self.joints.get(joint)
-        return None if known is None else known.clock.lag
+        return self._known(joint).clock.lag
 
     def is_past(self, joint: str, time: int, now: int) -> bool:
         """Return whether a time of a device can have passed by one of the planner's clock."""
-        known = self.joints.get(joint)
-        return known is None or known.clock.is_past(time, now)
+        return self._known(joint).clock.is_past(time, now)
 
     def offset_of(self, joint: str) -> Offset | None:
         """Return the clock offset of a joint's device; None if unknown."""
-        known = self.joints.get(joint)
-        return None if known is None else known.clock.offset
+        return self._known(joint).clock.offset
 
     def figures(self) -> dict[str, object]:
         """Return the values of the clock offset for /diagnostics, if it is known."""

@@ -144,17 +144,15 @@ def check_request(
     if not isinstance(request, Trajectory):
         return
     names = request.joints
-    if not request.count:
-        # A stop of all joints.
-        if unknown := [x for x in names if x not in joints]:
-            raise _unknown(f'has {excerpt(unknown[0])}: expected names among {", ".join(joints)}')
-        return
-    if len(joints) == 1 and names != tuple(joints):
+    if request.count and len(joints) == 1 and names != tuple(joints):
         raise _unknown(f'is {excerpt(list(names))}: expected {list(joints)}')
-    if twice := sorted({x for x in names if names.count(x) > 1}):
+    if request.count and (twice := sorted({x for x in names if names.count(x) > 1})):
         raise _unknown(f'has {excerpt(twice[0])} twice: expected each joint once')
     if unknown := [x for x in names if x not in joints]:
         raise _unknown(f'has {excerpt(unknown[0])}: expected names among {", ".join(joints)}')
+    if not request.count:
+        # A stop of all joints.
+        return
     missing = [x for x in joints if x not in names]
     if not names or missing and not settings.allow_partial_joints:
         raise _unknown(

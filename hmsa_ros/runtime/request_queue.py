@@ -287,10 +287,10 @@ def _accepted(drafts: Mapping[str, Draft]) -> tuple[Severity, Code, str]:
             if segment.left is not None and (
                     ringing is None or segment.left.vibration > most):
                 ringing, most = segment, segment.left.vibration
-    words = ['accepted', '' if ringing is None else ringing.told]
+    words = ['accepted'] if ringing is None else ['accepted', ringing.told]
     if left:
         words.append(f'levels that follow creep leave a vibration of up to {left:.1e}')
-    return Severity.OK, Code.ACCEPTED, '; '.join(words if ringing else [words[0], *words[2:]])
+    return Severity.OK, Code.ACCEPTED, '; '.join(words)
 
 
 def _of_trajectory(request: Trajectory, group: PlannerGroup) -> PlanningTask:

@@ -97,7 +97,7 @@ class Runtime:
             group, self.deviations, self._watch, around, self._outputs, self._note,
             lambda: around.unheard() or receipts.words, self._unseen)
         self._stops = Stops(
-            group, self.devices, self.deviations.newest, self._watch, around, around.unheard,
+            group, self.devices, self.deviations.newest, self._watch, around,
             lambda: self.settings.tolerances)
         self.devices.stops = lambda: self._stops.judges
         self.temperatures = Temperatures(group, lambda: self.settings, clock, self._note)

@@ -39,18 +39,16 @@ class Stops:
     def __init__(
             self, group: PlannerGroup, devices: CommandLink,
             newest: Mapping[str, tuple[int, float]],
-            watch: ArrivalMonitor, environment: Environment, unheard: Callable[[], str],
+            watch: ArrivalMonitor, environment: Environment,
             tolerances: Callable[[], Tolerances]) -> None:
         """
         Begin without a stop.
 
-        ``newest`` contains timestamp in ns and level in T of the newest change of each joint, and
-        ``unheard`` returns why commands are not carried out. A vibration within the tolerances
-        is rest.
+        ``newest`` contains timestamp in ns and level in T of the newest change of each joint. A
+        vibration within the tolerances is rest.
         """
         self._group, self._devices, self._newest = group, devices, newest
-        self._watch, self._around, self._unheard = watch, environment, unheard
-        self._tolerances = tolerances
+        self._watch, self._around, self._tolerances = watch, environment, tolerances
         self._plan: int | None = None  # number of the plan of the stop; None without one
         self._over = False  # whether it was acknowledged
         self._name = ''
@@ -126,7 +124,7 @@ class Stops:
         applied = self._differs(joint, now)
         if received:
             return not applied
-        if self._unheard():
+        if self._around.unheard():
             return False
         return applied is False or self._shows_rest(joint) is True
 
@@ -168,7 +166,7 @@ class Stops:
         receipts, passed = self._devices.receipts, (steady - self._begun) / NANOSECONDS
         received = receipts.carried_out(joint, level.due)
         if received is None:
-            if unheard := self._unheard():
+            if unheard := self._around.unheard():
                 return f'stop sent, but {unheard}; {_SWITCH_OFF}, if there is one'
             if self._differs(joint, now) is None:
                 return (
