@@ -13,6 +13,7 @@ import itertools
 import os
 from pathlib import Path
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -26,7 +27,8 @@ from forks import Forked, ForkServer
 from hypothesis import HealthCheck, Phase, settings
 import pytest
 
-from hmsa.cli import terminal
+from hmsa.cli import main, terminal
+from hmsa.interfaces.topics import CLOCK_TOPIC, Topic
 from hmsa_ros.middleware import fast_dds, PROFILES, profiles
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -187,11 +189,14 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             place.get(item, place.get(item.path, 0.0))))
 
 
-def bound(kind: Any, qos: Any = 1000) -> tuple[Any, Any]:
-    """Return message class and profile, from rclpy objects or `hmsa.interfaces` names."""
+def bound(kind: Any, name: str = '', qos: Any = None) -> tuple[Any, str, Any]:
+    """Return message class, name and profile, from rclpy objects or those of `hmsa.interfaces`."""
     from hmsa_ros.nodes import ros_entities
     from hmsa_ros.nodes.ros_entities import interface_class
-    return (interface_class(kind) if isinstance(kind, str) else kind,
+    if isinstance(kind, Topic):
+        kind, name, qos = kind.type, name or kind.name, qos or kind.qos
+    qos = 1000 if qos is None else qos
+    return (interface_class(kind) if isinstance(kind, str) else kind, name,
             ros_entities.profile(qos) if isinstance(qos, ros_entities.Quality) else qos)
 
 
@@ -228,6 +233,32 @@ def bags_are_whole_for_rosbags(request: pytest.FixtureRequest) -> Iterator[None]
 def wait_until_fixture() -> Callable[..., Any]:
     """Return `wait_until`, for test modules that cannot import this one."""
     return wait_until
+
+
+@pytest.fixture
+def command(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
+    """Return a function that runs ``hmsa`` with a line and more words: status and both outputs."""
+    def run(line: str, *words: object) -> tuple[int, str, str]:
+        capsys.readouterr()
+        try:
+            status = main([*shlex.split(line), *map(str, words)])
+        except SystemExit as end:
+            status = end.code
+        return status, *capsys.readouterr()
+
+    return run
+
+
+@pytest.fixture
+def refusal(command: Callable[..., tuple[int, str, str]]) -> Callable[..., str]:
+    """Return a function that expects bad input of ``hmsa``, and returns the one line about it."""
+    def refused(line: str, *words: object) -> str:
+        status, out, err = command(line, *words)
+        assert (status, out) == (2, '')
+        assert re.fullmatch(r'hmsa: error: [^\n]+\n', err)
+        return err
+
+    return refused
 
 
 @contextmanager
@@ -495,14 +526,14 @@ class RosSide:
         again.cancel()
 
     def collect(
-            self, message_type: type[Any] | str, topic: str, qos: Any = 1000) -> list[Any]:
+            self, kind: type[Any] | str | Topic, topic: str = '', qos: Any = None) -> list[Any]:
         """
-        Subscribe, and return the list that received messages are appended to.
+        Subscribe to a type, or a topic of `hmsa.interfaces`; return the list of what comes.
 
         Nodes of `Served` have discovered the subscription then, so that every later message
         arrives.
         """
-        message_type, qos = bound(message_type, qos)
+        message_type, topic, qos = bound(kind, topic, qos)
         messages: list[Any] = []
         before = {x: x.get_subscription_count() for x in Served.publishers()}
         name = self.node.create_subscription(
@@ -513,14 +544,14 @@ class RosSide:
         return messages
 
     def publisher(
-            self, message_type: type[Any] | str, topic: str, qos: Any = 1000,
+            self, kind: type[Any] | str | Topic, topic: str = '', qos: Any = None,
             subscribers: int = 1) -> Any:
         """
         Return a publisher with a number of matched subscribers.
 
         Nodes of `Served` have discovered the publisher then, so that its messages arrive.
         """
-        message_type, qos = bound(message_type, qos)
+        message_type, topic, qos = bound(kind, topic, qos)
         before = {x: x.get_publisher_count() for x in Served.subscriptions()}
         publisher = self.node.create_publisher(message_type, topic, qos)
         self.spin_until(
@@ -533,7 +564,7 @@ class RosSide:
     def call(self, service_type: type[Any] | str, name: str, request: Any = None) -> Any:
         """Call a service once its nodes have discovered the client; return its response."""
         from hmsa_ros.nodes.temporary_node import ServiceCall
-        service_type, _ = bound(service_type)
+        service_type, *_ = bound(service_type)
         full = self.node.resolve_service_name(name)
         before = {x: x.count_clients(full) for x in Served.views()}
         call = ServiceCall(
@@ -694,13 +725,9 @@ class SimulatedClock:
     """
 
     def __init__(self, side: RosSide, served: Served) -> None:
-        from rclpy.qos import QoSProfile, ReliabilityPolicy
-        from rosgraph_msgs.msg import Clock
         self._side = side
         self._served = served
-        self._publisher = side.publisher(
-            Clock, '/clock', QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT),
-            subscribers=len(served.nodes))
+        self._publisher = side.publisher(CLOCK_TOPIC, subscribers=len(served.nodes))
 
     def set(self, time_ns: int) -> None:
         """Set the time in ns, perhaps back, and return when all nodes have received it."""

@@ -16,7 +16,7 @@ from conftest import without_progress
 from extras import needs
 import pytest
 
-from hmsa.cli import main, terminal
+from hmsa.cli import terminal
 from hmsa.errors import BadInputError
 from hmsa.planning.shapers import SHAPERS
 from hmsa_studies import feedback, paper_data, robustness
@@ -32,30 +32,16 @@ QUICKLY = '--dpi', 50, '--format', 'png'
 
 
 @pytest.fixture
-def run(capsys, tmp_path, monkeypatch):
-    """Return a runner of ``hmsa`` in an empty folder: status, standard output and error."""
+def run(command, tmp_path, monkeypatch):
+    """Return `command` in an empty folder."""
     monkeypatch.chdir(tmp_path)
-
-    def run_words(*words):
-        try:
-            status = main([str(word) for word in words])
-        except SystemExit as end:
-            status = end.code
-        return status, *capsys.readouterr()
-
-    return run_words
+    return command
 
 
 @pytest.fixture
-def refused(run):
-    """Return a runner that expects bad input, and returns its one-line message."""
-    def run_words(*words):
-        status, out, err = run(*words)
-        assert (status, out, err.count('\n')) == (2, '', 1)
-        assert err.startswith('hmsa: error: ')
-        return err
-
-    return run_words
+def refused(run, refusal):
+    """Return `refusal` in an empty folder."""
+    return refusal
 
 
 # --- robustness
@@ -82,12 +68,12 @@ def test_robustness_prints_a_table_and_names_its_files(run, tmp_path):
         assert (tmp_path / path).read_bytes().startswith(PNG if path[-3:] == 'png' else b'%PDF')
 
 
-@pytest.mark.parametrize(('command', 'words'), [
+@pytest.mark.parametrize(('name', 'words'), [
     ('robustness', ('--move', '1:1.1', '--shapers', 'two_step', '--errors', 0.02, *QUICKLY)),
     ('sweep', ('--zeta', '0:1:3', '--out', 'a.csv', '--picture', 'a.png'))])
-def test_a_study_that_draws_for_long_says_so(run, monkeypatch, command, words):
+def test_a_study_that_draws_for_long_says_so(run, monkeypatch, name, words):
     monkeypatch.setattr(terminal, 'PATIENCE', 0.01)
-    status, _, err = run(command, *words)
+    status, _, err = run(name, *words)
     assert (status, 'drawing ...' in err.splitlines()) == (0, True)
 
 
@@ -193,23 +179,15 @@ def test_robustness_takes_the_actuator_of_a_file_with_its_law_and_its_coil(
 
 
 @pytest.mark.parametrize(('words', 'message'), [
-    (['--move', '1.4'], "'1.4': expected START:TARGET"),
-    (['--move', 'a:b'], "'a:b'"),
-    (['--move', '1:1'], 'two stretches that differ'),
-    (['--move', '1:9'], 'target stretch is 9'),
-    (['--move', '1:nan'], 'target stretch is nan'),
-    (['--shapers', 'zvdd'], "shaper is 'zvdd': expected one of"),
-    (['--shapers', ''], "shaper is '': expected one of"),
-    (['--errors', '0'], 'expected numbers above 0'),
-    (['--errors', '1'], 'to 0.9'),
-    (['--errors', 'nan'], 'nan'),
-    (['--order', '0'], 'expected 1 to 100'),
-    (['--order', '2.5'], "'2.5'"),
-    (['--zeta', '-1'], 'zeta is -1'),
-    (['--j-lim', '0'], 'j_lim is 0'),
-])
+    ('--move 1.4', "'1.4': expected START:TARGET"), ('--move a:b', "'a:b'"),
+    ('--move 1:1', 'two stretches that differ'), ('--move 1:9', 'target stretch is 9'),
+    ('--move 1:nan', 'target stretch is nan'),
+    ('--shapers zvdd', "shaper is 'zvdd': expected one of"),
+    ("--shapers ''", "shaper is '': expected one of"), ('--errors 0', 'expected numbers above 0'),
+    ('--errors 1', 'to 0.9'), ('--errors nan', 'nan'), ('--order 0', 'expected 1 to 100'),
+    ('--order 2.5', "'2.5'"), ('--zeta -1', 'zeta is -1'), ('--j-lim 0', 'j_lim is 0')])
 def test_robustness_refuses_bad_input_in_one_line(refused, tmp_path, words, message):
-    assert message in refused('robustness', *words)
+    assert message in refused(f'robustness {words}')
     assert list(tmp_path.iterdir()) == []
 
 
@@ -297,19 +275,15 @@ def test_sweep_says_how_to_get_parquet_where_it_is_missing(refused, tmp_path, mo
 
 
 @pytest.mark.parametrize(('words', 'message'), [
-    (['--zeta', '0:2'], "zeta is '0:2'"),
-    (['--target', '0'], 'greater than 0'),
-    (['--cases', 'none.csv'], 'cannot read none.csv: No such file'),
-    (['--cases', '.'], 'cannot read .: Is a directory'),
-    (['--out', 'o.txt'], '.csv or .parquet'),
-    (['--out', 'none/o.csv'], 'cannot write none/o.csv: none is no folder'),
-    (['--out', 'none/o.parquet'], 'none/o.parquet'),
-    (['--rate', '1'], '--rate'),
-])
+    ('--zeta 0:2', "zeta is '0:2'"), ('--target 0', 'greater than 0'),
+    ('--cases none.csv', 'cannot read none.csv: No such file'),
+    ('--cases .', 'cannot read .: Is a directory'), ('--out o.txt', '.csv or .parquet'),
+    ('--out none/o.csv', 'cannot write none/o.csv: none is no folder'),
+    ('--out none/o.parquet', 'none/o.parquet'), ('--rate 1', '--rate')])
 def test_sweep_refuses_bad_input_in_one_line(refused, tmp_path, words, message):
     if 'none/o.parquet' in words:
         needs('pyarrow')
-    assert message in refused('sweep', *words)
+    assert message in refused(f'sweep {words}')
     assert list(tmp_path.iterdir()) == []
 
 

@@ -4,7 +4,6 @@ from dataclasses import replace
 import json
 import math
 from pathlib import Path
-import re
 
 from extras import needs
 import numpy as np
@@ -13,7 +12,6 @@ import yaml
 
 from hmsa.api.actuator import Actuator
 from hmsa.api.facts import scales
-from hmsa.cli import main
 from hmsa.errors import BadInputError
 from hmsa.interfaces.quantities import BY_KEY, DAMPING, OPTIONAL, QUANTITIES, quantity_of
 from hmsa.model.equations import elastic_force, natural_frequency
@@ -30,18 +28,10 @@ OWN = ['--half-length', '5mm', '--half-thickness', '4 mm', '--shear-modulus', '3
 
 
 @pytest.fixture
-def run(capsys, tmp_path, monkeypatch):
+def run(command, tmp_path, monkeypatch):
     """Return a runner of ``hmsa init`` in an empty folder: status, standard output and error."""
     monkeypatch.chdir(tmp_path)
-
-    def run_words(*words):
-        try:
-            status = main(['init', *map(str, words)])
-        except SystemExit as end:
-            status = end.code
-        return status, *capsys.readouterr()
-
-    return run_words
+    return lambda *words: command('init', *words)
 
 
 def parameters(path):
@@ -248,29 +238,24 @@ def test_a_file_that_exists_is_kept_unless_forced(run, tmp_path):
 
 
 @pytest.mark.parametrize(('words', 'said'), [
-    (['--density', 'heavy'], "density is 'heavy': expected a number with or without a unit"),
-    (['--density', '5 mm'], "unit 'mm': expected one of kg/m^3"),
-    (['--half-length', '0'], 'half length is 0 m: expected 1e-09 to 1000 m'),
-    (['--half-length=-1mm'], 'half length is -0.001 m'),
-    (['--shear-modulus', 'nan'], "shear modulus is 'nan'"),
-    (['--remanence', '1e999'], 'remanence is inf T'),
-    (['--j-lim', '5 Pa'], "unit 'Pa': expected a number without a unit"),
-    (['--zeta', '1', '--damping', '1'], 'both --zeta and --damping'),
-    (['--zeta', '1', '--damping-ratio', '0.4'], 'both --zeta and --damping-ratio'),
-    (['--beam', '--damping-ratio', '0.1', '--damping', '1'], 'both --damping-ratio and --damping'),
-    (['--beam', '--zeta', '1'], '--zeta is given: expected sizes of a beam'),
-    (['--flux-min', '0.5'], 'expected the minimum below the maximum'),
-    (['--joint', '1st'], "joint '1st': expected letters"),
-    (['--joint', 'a__b'], "joint 'a__b'"),
-    (['--joint', 'a,a'], 'named twice'),
-    (['--out', 'no/where.yaml'], 'is no folder'),
-    (['--out', '/dev/full', '--force'], 'cannot write /dev/full'),
-])
-def test_bad_input_is_answered_in_one_line_and_writes_nothing(run, tmp_path, words, said):
-    status, out, err = run('--yes', *words)
-    assert (status, out) == (2, '')
-    assert re.fullmatch(r'hmsa: error: [^\n]+\n', err)
-    assert said in err
+    ('--density heavy', "density is 'heavy': expected a number with or without a unit"),
+    ("--density '5 mm'", "unit 'mm': expected one of kg/m^3"),
+    ('--half-length 0', 'half length is 0 m: expected 1e-09 to 1000 m'),
+    ('--half-length=-1mm', 'half length is -0.001 m'),
+    ('--shear-modulus nan', "shear modulus is 'nan'"), ('--remanence 1e999', 'remanence is inf T'),
+    ("--j-lim '5 Pa'", "unit 'Pa': expected a number without a unit"),
+    ('--zeta 1 --damping 1', 'both --zeta and --damping'),
+    ('--zeta 1 --damping-ratio 0.4', 'both --zeta and --damping-ratio'),
+    ('--beam --damping-ratio 0.1 --damping 1', 'both --damping-ratio and --damping'),
+    ('--beam --zeta 1', '--zeta is given: expected sizes of a beam'),
+    ('--flux-min 0.5', 'expected the minimum below the maximum'),
+    ('--joint 1st', "joint '1st': expected letters"), ('--joint a__b', "joint 'a__b'"),
+    ('--joint a,a', 'named twice'), ('--out no/where.yaml', 'is no folder'),
+    ('--out /dev/full --force', 'cannot write /dev/full')])
+def test_bad_input_is_answered_in_one_line_and_writes_nothing(
+        refusal, tmp_path, monkeypatch, words, said):
+    monkeypatch.chdir(tmp_path)
+    assert said in refusal(f'init --yes {words}')
     assert list(tmp_path.iterdir()) == []
 
 
@@ -286,24 +271,20 @@ def test_it_says_what_is_missing(run, tmp_path):
 # What is implausible -------------------------------------------------------------------------
 
 @pytest.mark.parametrize(('words', 'said'), [
-    (['--shear-modulus', '79 GPa'], 'metals have'),
-    (['--shear-modulus', '30'], 'did you mean kPa'),
-    (['--density', '1.2'], 'that is air'),
-    (['--density', '1.9'], 'did you mean g/cm^3'),
-    (['--remanence', '1.6'], 'N55'),
-    (['--remanence', '80'], 'did you mean mT'),
-    (['--half-thickness', '5'], 'half thickness 5 m is unusual (did you mean mm?)'),
-    (['--half-length', '5'], 'half length 5 m is unusual (did you mean mm?)'),
-    (['--half-thickness', '0.1mm'], 'thin film'),
-    (['--flux-max', '50'], 'flux max 50 T is unusual (did you mean mT?)'),
-    (['--flux-min', '0.01'], 'flux min 0.01 T is unusual'),
-    (['--zeta', '3'], 'zeta 3 is above the critical 2.44949'),
-    (['--damping', '20'], 'zeta 5.73539'),
-    (['--j-lim', '1000'], 'Gent'),
-    (['--flux-max', '1mT'], 'a stretch of 1.1 or 0.9 needs about'),
-])
-def test_what_is_implausible_is_warned_of_with_the_usual_range(run, tmp_path, words, said):
-    status, out, err = run('--yes', '--json', *words)
+    ("--shear-modulus '79 GPa'", 'metals have'), ('--shear-modulus 30', 'did you mean kPa'),
+    ('--density 1.2', 'that is air'), ('--density 1.9', 'did you mean g/cm^3'),
+    ('--remanence 1.6', 'N55'), ('--remanence 80', 'did you mean mT'),
+    ('--half-thickness 5', 'half thickness 5 m is unusual (did you mean mm?)'),
+    ('--half-length 5', 'half length 5 m is unusual (did you mean mm?)'),
+    ('--half-thickness 0.1mm', 'thin film'),
+    ('--flux-max 50', 'flux max 50 T is unusual (did you mean mT?)'),
+    ('--flux-min 0.01', 'flux min 0.01 T is unusual'),
+    ('--zeta 3', 'zeta 3 is above the critical 2.44949'), ('--damping 20', 'zeta 5.73539'),
+    ('--j-lim 1000', 'Gent'), ('--flux-max 1mT', 'a stretch of 1.1 or 0.9 needs about')])
+def test_what_is_implausible_is_warned_of_with_the_usual_range(
+        command, tmp_path, monkeypatch, words, said):
+    monkeypatch.chdir(tmp_path)
+    status, out, err = command(f'init --yes --json {words}')
     assert status == 0
     warnings = json.loads(out)['warnings']
     assert any(said in x for x in warnings)

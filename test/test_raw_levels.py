@@ -10,7 +10,6 @@ from mcap_ros2.decoder import DecoderFactory
 import numpy as np
 import pytest
 
-from hmsa.cli import main
 from hmsa.identification.excitation import Bounds, excite
 from hmsa.identification.measurement import read_levels
 from hmsa.model.status import Code, RefusedError
@@ -86,22 +85,18 @@ def test_levels_that_break_a_limit_are_refused(levels, options, code, words):
     assert raised.value.code is code
 
 
-@pytest.mark.parametrize(('arguments', 'message'), [
-    ([], 'neither setpoints nor --levels'), (['1.1:1', '--levels', 'x.csv'], 'both setpoints'),
-    (['--levels', 'x.csv'], 'x.csv cannot be read')])
-@pytest.mark.parametrize('command', ['send', 'run'])
+@pytest.mark.parametrize(('words', 'message'), [
+    ('', 'neither setpoints nor --levels'), ('1.1:1 --levels x.csv', 'both setpoints'),
+    ('--levels x.csv', 'x.csv cannot be read')])
+@pytest.mark.parametrize('name', ['send', 'run'])
 def test_bad_arguments_end_with_2_and_a_sentence(
-        tmp_path, monkeypatch, capsys, command, arguments, message):
+        tmp_path, monkeypatch, refusal, name, words, message):
     monkeypatch.chdir(tmp_path)
-    assert main([command, *arguments]) == 2
-    out, err = capsys.readouterr()
-    assert (out, err.count('\n')) == ('', 1)
-    assert message in err
+    assert message in refusal(f'{name} {words}')
 
 
-def test_a_tolerance_for_levels_is_refused(capsys):
-    assert main(['run', '--levels', 'x.csv', '--tolerance', '0.1']) == 2
-    assert '--tolerance is given with --levels' in capsys.readouterr().err
+def test_a_tolerance_for_levels_is_refused(refusal):
+    assert '--tolerance is given with --levels' in refusal('run --levels x.csv --tolerance 0.1')
 
 
 @pytest.mark.slow

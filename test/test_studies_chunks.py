@@ -12,7 +12,6 @@ import sys
 from extras import needs
 import pytest
 
-from hmsa.cli import main
 from hmsa.errors import BadInputError, HmsaError
 from hmsa_studies import schedulers, study_folder
 from hmsa_studies.commands.chunked import parse_shard
@@ -45,18 +44,10 @@ def expected(sweep, tmp_path_factory):
 
 
 @pytest.fixture
-def run(capsys, tmp_path, monkeypatch):
+def run(command, tmp_path, monkeypatch):
     """Return a runner of the sweep in an empty folder: status, standard output and error."""
     monkeypatch.chdir(tmp_path)
-
-    def run_words(*words):
-        try:
-            status = main(['sweep', *WORDS, *words])
-        except SystemExit as end:
-            status = end.code
-        return status, *capsys.readouterr()
-
-    return run_words
+    return lambda *words: command('sweep', *WORDS, *words)
 
 
 def chunk_files(folder):
@@ -219,18 +210,13 @@ def test_shards_that_do_not_exist_are_refused(text):
 
 
 @pytest.mark.parametrize(('words', 'message'), [
-    (['--workers=0', '--out=a'], '--workers is 0'),
-    (['--workers=2'], '--workers without --out'),
-    (['--shard=0/2'], '--shard without --out'),
-    (['--shard=7/2', '--out=a'], "'7/2'"),
+    (['--workers=0', '--out=a'], '--workers is 0'), (['--workers=2'], '--workers without --out'),
+    (['--shard=0/2'], '--shard without --out'), (['--shard=7/2', '--out=a'], "'7/2'"),
     (['--dask=tcp://x:1', '--workers=2', '--out=a'], 'one of them'),
     (['--workers=1', '--out=a.txt'], '.csv or .parquet'),
-    (['--workers=1', '--out=none/a.csv'], 'cannot write none/a.csv'),
-])
-def test_options_that_do_not_fit_are_refused_in_one_line(run, tmp_path, words, message):
-    status, out, err = run(*words)
-    assert (status, out, err.count('\n')) == (2, '', 1)
-    assert message in err
+    (['--workers=1', '--out=none/a.csv'], 'cannot write none/a.csv')])
+def test_options_that_do_not_fit_are_refused_in_one_line(refusal, run, tmp_path, words, message):
+    assert message in refusal('sweep', *WORDS, *words)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -143,20 +143,13 @@ def test_magnets_above_their_limit_are_warned_of():
         silicone.at_temperature(70.0)
 
 
-def test_hmsa_plan_takes_a_temperature(capsys, tmp_path):
+def test_hmsa_plan_takes_a_temperature(capsys, tmp_path, refusal):
     file = str(tmp_path / 'a.yaml')
     hmsa.Actuator(thermal=COEFFICIENTS).to_yaml(file)
     assert main(['plan', '1.1:0.2', '--params-file', file, '--temperature', '40 C']) == 0
     assert 'at 40 degrees Celsius' in capsys.readouterr().out
-    for more, words in (
-            (['--params-file', file, '--temperature', '298'], 'not kelvin'),
-            (['--temperature', '40'], 'expected --params-file')):
-        try:
-            status = main(['plan', '1.1:10', *more])
-        except SystemExit as error:
-            status = error.code
-        assert status == 2
-        assert words in capsys.readouterr().err
+    assert 'not kelvin' in refusal('plan 1.1:10 --temperature 298 --params-file', file)
+    assert 'expected --params-file' in refusal('plan 1.1:10 --temperature 40')
 
 
 # -- the simulated block -------------------------------------------------------------------------
