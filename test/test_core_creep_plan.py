@@ -47,10 +47,8 @@ def left(segments, creep, longest=40.0, delivery=IDEAL):
 
 
 @pytest.mark.parametrize(('material', 'shaper', 'delivery', 'wanted'), [
-    (ONE, 'two_step', SAMPLED, 3e-4),
-    (THREE, 'robust', Delivery(), 1e-3),
-    (ONE, 'two_step', Delivery(lag=0.12), 1e-6),
-    (ONE, 'robust', Delivery(slew=0.6), 1.1e-6),
+    (ONE, 'two_step', SAMPLED, 3e-4), (THREE, 'robust', Delivery(), 1e-3),
+    (ONE, 'two_step', Delivery(lag=0.12), 1e-6), (ONE, 'robust', Delivery(slew=0.6), 1.1e-6),
     *(pytest.param(*x, marks=pytest.mark.slow) for x in (
         (ONE, 'two_step', Delivery(), 1e-6),
         (THREE, 'two_step', SAMPLED, 1e-3),
@@ -170,7 +168,7 @@ def test_of_a_creeping_block_in_error_minimax_leaves_less_than_the_chain(deliver
                  if x.time < move.duration + 2.6],
                 replace(THREE.creep, times=tuple(x * faster for x in THREE.creep.times)),
                 arrived + 2.6 * faster, delivery.slew / stiffer / faster, delivery.lag * faster,
-                0.2 / faster)
+                zeta=0.2 / faster)
             # Off by as much, it creeps on meanwhile.
             after = times >= arrived
             drift = np.polyfit(times[after], stretch[after], 1)

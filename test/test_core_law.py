@@ -2,9 +2,9 @@
 
 import math
 
+from core_oracle import turning_point
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from hmsa.model import law
@@ -36,17 +36,8 @@ def test_without_a_chain_limit_the_law_is_neo_hookean():
 @pytest.mark.parametrize(('start', 'target'), [(1.0, 1.1), (1.2, 4.0), (1.0, 0.2), (6.0, 1.0)])
 def test_a_neo_hookean_plan_is_that_of_an_independent_solution(start, target):
     def turn(beta):
-        def motion(_, y):
-            x, v = y
-            inertia = (x ** -3 + 2.0) / 6.0
-            return v, (beta - (x - x ** -2) - 0.2 * v + 0.25 * v * v * x ** -4) / inertia
-        back = lambda _, y: y[1]  # noqa: E731
-        back.terminal, back.direction = True, -1.0 if target > start else 1.0
-        away = 1e-9 * (target - start)
-        done = solve_ivp(
-            motion, (0.0, 100.0), (start, away), method='DOP853', rtol=1e-12, atol=1e-13,
-            events=back)
-        return done.t[-1], done.y[0, -1]
+        return turning_point(
+            (start, 0.0), beta, math.copysign(1.0, target - start), 0.2, math.inf, 2.0)
 
     plan = plan_two_step(start, target, NEO_HOOKEAN)
     assert plan.code is Code.TWO_STEP

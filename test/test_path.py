@@ -1,13 +1,12 @@
 """Paths with velocities, followed, judged by SciPy's integration of the equation of motion."""
 
 from dataclasses import replace
-from itertools import pairwise
 import json
 import math
 import re
 
 from at_work import AtWork, planner
-from core_oracle import integrate
+from creep_oracle import elastic, follow
 import numpy as np
 import pytest
 from scipy.interpolate import CubicHermiteSpline
@@ -21,53 +20,20 @@ from hmsa.planning.planner import Options, Planner
 from hmsa_ros.runtime.records import Settings, Severity, Trajectory
 
 SECOND = 1_000_000_000
-# The paper's block: units of time (s) and load (T), damping, shape and chain limit.
+# Units of time (s) and load (T) of the paper's block.
 TIME, LOAD = 0.01 * math.sqrt(1900.0 / 1e4), 4e-7 * math.pi * 1e4 / 0.1
-ZETA, C1, J_LIM = 0.2, 2.0, 5.0
 CREEP = ((0.1, 0.02),)
 FOLLOWED = 1e-6
 NAN = math.nan
 
 
-def force(x):
-    """Return psi' of the paper's block."""
-    return (x - x ** -2) / (1.0 - (x * x + 2.0 / x - 3.0) / J_LIM)
-
-
 def moved(levels, times, start=1.0, slew=math.inf, lag=0.0, creep=()):
     """Return stretches at times (s) under levels (s, T), with ramps and lag, by SciPy."""
-    ratios, speeds = [x for x, _ in creep], [TIME / x for _, x in creep]
-
-    def motion(t, y, load, slope, begin):
-        x, v, field, *held = y.tolist()
-        output = load + slope * (t - begin)
-        pull = (field if lag else output) - force(x) - sum(held)
-        stiffness = (force(x + 1e-6) - force(x - 1e-6)) / 2e-6 if held else 0.0
-        return [v, (pull - 0.5 * ZETA * C1 * v + 0.25 * x ** -4 * v * v) * 6.0 / (x ** -3 + C1),
-                (output - field) * TIME / lag if lag else 0.0,
-                *(r * stiffness * v - s * h for r, s, h in zip(ratios, speeds, held, strict=True))]
-
-    times, slew = times / TIME, slew * TIME / LOAD
-    y, load = np.array([start, 0.0, force(start), *(0.0 for _ in creep)]), force(start)
-    found, done = np.empty(len(times)), 0
-    end = max(times[-1], levels[-1][0] / TIME) + 1e-9
-    for (begin, level), (until, _) in pairwise([
-            *((t / TIME, x / LOAD) for t, x in levels), (end, 0.0)]):
-        change = level - load
-        ramp = min(begin + abs(change) / slew, until)
-        reached = level if ramp < until else load + math.copysign(
-            min(slew * (until - begin), abs(change)), change)
-        for first, last, value, slope in (
-                (begin, ramp, load, math.copysign(min(slew, 1e9), change)),
-                (ramp, until, reached, 0.0)):
-            if last > first:
-                here = np.searchsorted(times, last)
-                seen = integrate(
-                    motion, [first, *times[done:here], last], y, value, slope, first,
-                    rtol=1e-12, atol=1e-12)
-                found[done:here], y, done = seen[1:-1, 0], seen[-1], here
-        load = reached
-    return found
+    held = elastic(start)[0]
+    return follow(
+        [(t / TIME, x / LOAD) for t, x in levels], times / TIME,
+        Creep(tuple(x for x, _ in creep), tuple(x / TIME for _, x in creep)), slew * TIME / LOAD,
+        lag / TIME, start=(start, 0.0), output=held)[:, 0]
 
 
 def dense(duration=0.1, count=41, goal=1.4, *, accelerations=False):
@@ -209,8 +175,7 @@ P = ((1.0, 0.0, NAN), 0)
 
 
 @pytest.mark.parametrize(('points', 'code', 'words'), [
-    ([], Code.BAD_INPUT, 'no points'),
-    ([P], Code.SPELL_TOO_SHORT, 'time_from_start 0'),
+    ([], Code.BAD_INPUT, 'no points'), ([P], Code.SPELL_TOO_SHORT, 'time_from_start 0'),
     ([P, ((1.1, 0.3, NAN), SECOND)], Code.BAD_INPUT, 'the last point has velocity 0.3'),
     ([P, ((1.1, NAN, NAN), SECOND)], Code.BAD_INPUT, 'velocity nan'),
     ([P, ((1.1, 0.0, 0.0), SECOND)], Code.BAD_INPUT, 'in all points or in none'),

@@ -3,10 +3,11 @@
 import math
 
 from at_work import AtWork, MS, planner
+from creep_oracle import C1, elastic, ZETA
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
-from test_path import C1, force, LOAD, TIME, ZETA
+from test_path import LOAD, TIME
 
 from hmsa import Actuator
 from hmsa.api.paths import smooth_points, wave_of, wave_path, wave_points
@@ -31,8 +32,8 @@ class Plant:
     def _motion(self, t, y):
         x, v, held = y.tolist()
         p = self.parameters
-        stiffness = (force(x + 1e-6) - force(x - 1e-6)) / 2e-6
-        pull = (p['remanence'] * self._load - p['g'] * (force(x) + held)
+        force, stiffness = elastic(x)
+        pull = (p['remanence'] * self._load - p['g'] * (force + held)
                 - 0.5 * p['damping'] * ZETA * C1 * v + 0.25 * x ** -4 * v * v)
         return [v, pull * 6.0 / (x ** -3 + C1), p['creep'] * stiffness * v - TIME / 0.05 * held]
 

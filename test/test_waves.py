@@ -4,9 +4,10 @@ import json
 import math
 import re
 
+from creep_oracle import C1
 import numpy as np
 import pytest
-from test_path import C1, moved, TIME
+from test_path import moved, TIME
 
 from hmsa import Actuator, UnusualWarning
 from hmsa.cli import main
@@ -161,8 +162,7 @@ def test_a_wave_that_is_only_possible_about_the_resonance_has_both_limits():
     ('sine', {'amplitude': 0.0}, 'amplitude is 0'),
     ('square', {'amplitude': 2.0}, 'an extreme of the wave is -1'),
     ('sine', {'offset': math.inf}, 'an extreme of the wave is inf'),
-    ('sine', {'cycles': 0.5}, 'cycles is 0.5'),
-    ('sine', {'last': -3.0}, 'frequency is -3 Hz'),
+    ('sine', {'cycles': 0.5}, 'cycles is 0.5'), ('sine', {'last': -3.0}, 'frequency is -3 Hz'),
     ([(0.0, 1.0), (1.0, 1.1)], {}, 'at least 4 samples'),
     ([(x, 1.0) for x in range(5)], {}, 'stretches that vary'),
     ([(x, 1.0 + x) for x in range(5)], {}, 'a last sample equal to the first')])
