@@ -4,10 +4,10 @@ from dataclasses import replace
 import math
 
 from beam_oracle import silicone
+from bench_oracle import Plant
 import identification_oracle as oracle
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from hmsa.identification.quantities import Known
@@ -29,40 +29,6 @@ from hmsa_studies.linear import Linearised
 TARGET, BEGIN, MS = 1.4, 50_000_000, 1_000_000
 
 
-class Block:
-    """A block under levels in ns and T."""
-
-    def __init__(self, block):
-        self.block, self.levels = block, [(0, 0.0)]
-        self._time, self._state = 0, np.array([1.0, 0.0])
-
-    def command(self, begin, levels):
-        self.levels = [x for x in self.levels if x[0] < begin] + [
-            x for x in levels if x[0] >= begin]
-
-    def _slope(self, _, state, level):
-        block = self.block
-        inertia = block.density * block.half_length ** 2
-        damping = block.damping_coefficient * block.half_thickness / (
-            8.0 * block.half_length ** 2)
-        stretch, rate = state
-        total = (block.remanence * level / oracle.mu_0 - block.shear_modulus * oracle.force_of(
-            stretch, block.chain_limit) - damping * rate + 0.25 * inertia * rate ** 2
-            / stretch ** 4)
-        return [rate, total / (inertia * (stretch ** -3 + 2.0) / 6.0)]
-
-    def at(self, time):
-        """Return the stretch at a time in ns, not before the last one."""
-        while self._time < time:
-            level = [x for x in self.levels if x[0] <= self._time][-1][1]
-            until = min([x[0] for x in self.levels if x[0] > self._time] + [time])
-            self._state = solve_ivp(
-                self._slope, (0.0, (until - self._time) * 1e-9), self._state, method='DOP853',
-                rtol=1e-9, atol=1e-11, args=(level,)).y[:, -1]
-            self._time = until
-        return float(self._state[0])
-
-
 class Bench:
     """A block as a device, sampled at 1 kHz, 2 ms late, by a sensor with a bias."""
 
@@ -72,12 +38,12 @@ class Bench:
         self._changes, self._waiting, self._samples = [(0, 0, 0.0)], [], []
 
     def receive(self, joint, stamp, level):
-        self.block.command(stamp, [(stamp, level)])
+        self.block.command(stamp, level)
 
     def advance(self, time):
         self._changes += [(0, *x) for x in self.block.levels if self.time < x[0] <= time]
         while self.next_sample <= time:
-            shown = self.block.at(self.next_sample) + 1e-3 + (
+            shown = self.block.advance(self.next_sample)[0] + 1e-3 + (
                 self._noise * self._random.standard_normal())
             self._waiting.append(Sample(self.next_sample, *(np.array([x]) for x in (
                 shown, math.nan, math.nan))))
@@ -98,7 +64,7 @@ class Bench:
 
 def closed_loop(factor, noise=1e-3, seed=0, **settings):
     """Move to the target with the controller in simulated time; return the block."""
-    block = Block(replace(oracle.BLOCK, shear_modulus=factor * oracle.BLOCK.shear_modulus))
+    block = Plant(replace(oracle.BLOCK, shear_modulus=factor * oracle.BLOCK.shear_modulus), time=0)
     loop = Loop(
         PlannerGroup({'a': Planner(oracle.BLOCK, PlannerOptions(
             flux_density_min=-0.25, flux_density_max=0.25, lead_time=300_000))}),
@@ -113,7 +79,7 @@ def closed_loop(factor, noise=1e-3, seed=0, **settings):
 
 def left(block):
     """Return peak-to-peak and mean error over the next 15 ms, as fractions of the step."""
-    seen = np.array([block.at((90 + 0.2 * i) * MS) for i in range(75)])
+    seen = np.array([block.advance((90 + 0.2 * i) * MS)[0] for i in range(75)])
     level = block.levels[-1][1] * block.block.remanence / oracle.mu_0 / block.block.shear_modulus
     rest = brentq(lambda x: oracle.force_of(x, 5.0) - level, 1.01, 2.0)
     return np.ptp(seen) / 0.4, (rest - TARGET) / 0.4
@@ -151,10 +117,11 @@ def test_what_a_course_is_expected_to_leave_is_what_errors_drawn_from_the_covari
     expected = expect(estimate, course).size
     sizes = []
     for sign in (-1.0, 1.0):
-        block = Block(replace(
-            oracle.BLOCK, shear_modulus=math.exp(sign * 0.01) * oracle.BLOCK.shear_modulus))
-        block.command(MS, course.levels)
-        ends = np.array([block.at(course.arrival + i * MS // 10) for i in range(101)])
+        modulus = math.exp(sign * 0.01) * oracle.BLOCK.shear_modulus
+        block = Plant(replace(oracle.BLOCK, shear_modulus=modulus), time=0)
+        for level in course.levels:
+            block.command(*level)
+        ends = np.array([block.advance(course.arrival + i * MS // 10)[0] for i in range(101)])
         level = course.holding * oracle.BLOCK.remanence / oracle.mu_0 / block.block.shear_modulus
         rest = brentq(lambda x, level=level: oracle.force_of(x, 5.0) - level, 1.01, 2.0)
         sizes.append(math.hypot(np.max(np.abs(ends - rest)), rest - TARGET))
@@ -189,14 +156,14 @@ def test_a_block_is_linearised_as_it_moves_under_small_changes_of_a_level_that_c
         block.remanence / oracle.mu_0)
     loads = 1e-4 * np.array([1.0, -2.0, 0.5, 0.0, 0.0, 3.0, 0.0, 0.0])
     model = Linearised.at(block, 1.2, holding, MS, 2 * MS + 300_000)
-    real = Block(block)
-    real._state = np.array([1.2, 0.0])
+    real = Plant(block, time=0)
+    real.state = np.array([1.2, 0.0, 0.0, 0.0])
     real.levels = [(0, holding)] + [
         (i * MS + 2 * MS + 300_000, holding + x * unit) for i, x in enumerate(loads)]
     z = np.zeros(5)
     for i, load in enumerate(loads):
         z = model.a @ z + model.b * load
-        assert z[0] == pytest.approx(real.at((i + 1) * MS) - 1.2, abs=3e-8)
+        assert z[0] == pytest.approx(real.advance((i + 1) * MS)[0] - 1.2, abs=3e-8)
     assert np.max(np.abs(z)) > 1e-5
 
 
