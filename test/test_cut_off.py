@@ -1,5 +1,6 @@
 """Commands that devices refuse: after a cut-off of the coil, too late, of another clock."""
 
+from devices import advance, command, MS, START
 import pytest
 
 from hmsa.errors import BadInputError
@@ -9,8 +10,6 @@ from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.device.watchdog import Fallback, Kind
 from hmsa_ros.device.worker import HardwareDevice, HardwareJoint
 
-MS = 1_000_000
-START = 1000 * MS
 ZERO = Fallback(0.1, 'zero')
 
 
@@ -100,8 +99,7 @@ def test_a_cut_off_that_is_acknowledged_is_over(make, by_hand):
 def test_a_coil_that_still_ramps_down_is_not_acknowledged(make):
     device = make(Fallback(0.1, 'ramp', 0.1))
     device.receive(0, START + MS, 0.05)
-    for step in range(1, 200):
-        device.advance(START + step * MS)
+    advance(device, *range(1, 200))
     named = device.guards[0].cut_off_time
     for stamp in (0, named):
         device.receive(0, stamp, 0.0)
@@ -181,8 +179,7 @@ def test_levels_that_are_sent_far_ahead_feed_the_watchdog_when_they_apply(make):
 @BOTH
 def test_a_level_that_comes_too_late_is_refused_and_does_not_feed_the_watchdog(make):
     device = make(Fallback(0.1, 'zero', lateness_limit=0.02))
-    device.receive(0, START + MS, 0.05)
-    device.advance(START + 2 * MS)
+    command(device, (1, 0.05), until=2)
     device.changes()
     device.receive(0, START + 2 * MS - 20 * MS, 0.04)
     device.advance(START + 3 * MS)
@@ -204,8 +201,7 @@ def test_a_level_that_comes_too_late_is_refused_and_does_not_feed_the_watchdog(m
 def test_a_level_that_is_held_through_a_silence_is_no_cut_off(make):
     device = make(Fallback(0.1, 'hold'))
     device.receive(0, START + MS, 0.05)
-    for time in (1, 300):
-        device.advance(START + time * MS)
+    advance(device, 1, 300)
     assert (device.silent, cut_offs(device)) == ([0], [])
     device.changes()
     assert not refused(device, START + 250 * MS, 0.02)
@@ -244,19 +240,15 @@ def test_a_command_of_another_clock_is_refused_by_its_name(make):
 
 def test_a_driver_that_stood_still_for_longer_than_its_watchdog_is_cut_off():
     device = driver(Fallback(0.1, 'zero'))
-    device.receive(0, START + MS, 0.05)
-    device.advance(START + 2 * MS)
+    command(device, (1, 0.05), until=2)
     device.advance_to(START + 92 * MS)
     device.stood_still(90 * MS)
-    device.receive(0, START + 95 * MS, 0.05)
-    device.advance(START + 100 * MS)
+    command(device, (95, 0.05), until=100)
     assert cut_offs(device) == []
     device.advance_to(START + 250 * MS)
     device.stood_still(150 * MS)
     # This has waited to be read.
-    device.receive(0, START + 240 * MS, 0.04)
-    device.receive(0, START + 290 * MS, 0.03)
-    device.advance(START + 300 * MS)
+    command(device, (240, 0.04), (290, 0.03), until=300)
     assert [x.level for x in device.changes()][-2:] == [0.05, 0.0]
     assert cut_offs(device) == [0]
     found = [x.text for x in device.notices() if x.kind is Kind.SILENT]
@@ -267,25 +259,17 @@ def test_a_driver_that_stood_still_for_longer_than_its_watchdog_is_cut_off():
 @pytest.mark.parametrize('safe', ['zero', 'ramp'])
 def test_levels_that_a_stall_has_made_late_do_not_keep_a_coil_on(safe):
     device = driver(Fallback(0.1, safe, lateness_limit=0.02))
-    device.receive(0, START + MS, 0.05)
-    device.receive(0, START + 50 * MS, 0.03)
-    device.receive(0, START + 80 * MS, 0.04)
-    device.advance(START + 2 * MS)
+    command(device, (1, 0.05), (50, 0.03), (80, 0.04), until=2)
     device.advance_to(START + 500 * MS)
     device.stood_still(498 * MS)
-    for time in range(501, 700):
-        device.advance(START + time * MS)
+    advance(device, *range(501, 700))
     assert (device.changes()[-1].level, cut_offs(device)) == (0.0, [0])
 
 
 def test_a_driver_drops_levels_that_it_could_not_write_in_time():
     device = driver(Fallback(10.0, 'zero', lateness_limit=0.02))
-    device.receive(0, START + 10 * MS, 0.05)
-    device.receive(0, START + 50 * MS, 0.03)
-    device.receive(0, START + 400 * MS, 0.02)
-    device.advance(START + 30 * MS)
-    device.advance(START + 300 * MS)
-    device.advance(START + 500 * MS)
+    command(device, (10, 0.05), (50, 0.03), (400, 0.02))
+    advance(device, 30, 300, 500)
     assert [x.level for x in device.changes()][-1] == 0.05
     assert '2 levels are dropped, the first of which is 0.250 s late' in device.notices()[-1].text
     # It was accepted, and would be acknowledged.
@@ -315,9 +299,7 @@ def test_a_simulation_that_stood_still_catches_up_with_what_has_waited():
 def test_a_clock_that_is_set_stops_nothing(make):
     for by in (-3_600_000, -5000, -500, 1000, 3_600_000):
         device = make(Fallback(0.1, 'zero'))
-        device.receive(0, START + MS, 0.05)
-        device.receive(0, START + 60 * MS, 0.03)
-        device.advance(START + 50 * MS)
+        command(device, (1, 0.05), (60, 0.03), until=50)
         device.samples()
         device.clock_set(by * MS)
         if make is plant:

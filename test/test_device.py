@@ -4,6 +4,7 @@ from collections import deque
 from dataclasses import replace
 import math
 
+from devices import command, MS, START
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
@@ -19,8 +20,6 @@ from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.device.watchdog import Fallback, GuardedJoint, judge_commands, Kind
 
 ACTUATOR = paper_actuator()
-MS = 1_000_000
-START = 1000 * MS
 
 
 def plant(*, fallback=None, errors=None, joints=1, **settings):
@@ -85,8 +84,7 @@ def test_a_command_for_at_once_is_not_late_and_a_late_one_is_told():
     device.receive(0, 0, 0.05)
     assert device.notices() == []
     device.advance(START + 5 * MS)
-    device.receive(0, START + 2 * MS, 0.02)
-    device.advance(START + 6 * MS)
+    command(device, (2, 0.02), until=6)
     assert told(device) == [(0.0, 0.05), (5.0, 0.02)]
     (notice,) = device.notices()
     assert (notice.kind, notice.joint, notice.late) == (Kind.LATE, 0, 3 * MS)
@@ -118,8 +116,7 @@ def test_a_joint_whose_load_is_too_large_starts_again_and_the_others_go_on():
 
 
 @pytest.mark.parametrize(('safe', 'ends'), [
-    ('hold', [(5.0, 0.05)]),
-    ('zero', [(5.0, 0.05), (101.0, 0.0)]),
+    ('hold', [(5.0, 0.05)]), ('zero', [(5.0, 0.05), (101.0, 0.0)]),
     ('ramp', [(5.0, 0.05)] + [
         (101.0 + k, pytest.approx(0.05 - 0.01 * k, abs=1e-15)) for k in range(1, 6)])])
 def test_silence_leads_to_the_safe_flux_and_a_command_back(safe, ends):
@@ -156,10 +153,8 @@ def test_a_heartbeat_is_a_sign_of_life_and_changes_nothing():
 def test_delays_hold_back_commands_and_samples_but_not_their_stamps():
     device = plant(command_delay=4 * MS, measurement_delay=3 * MS)
     # In time for 6 ms ahead, 2 ms late for 2 ms ahead.
-    device.receive(0, START + 6 * MS, 0.05)
-    device.advance(START + 10 * MS)
-    device.receive(0, START + 12 * MS, 0.02)
-    device.advance(START + 20 * MS)
+    command(device, (6, 0.05), until=10)
+    command(device, (12, 0.02), until=20)
     assert told(device) == [(6.0, 0.05), (14.0, 0.02)]
     assert [x.late for x in device.notices()] == [2 * MS]
     samples = device.samples()
@@ -177,8 +172,7 @@ def test_a_device_follows_a_clock_that_runs_stands_and_jumps():
     assert device.follow(START + 1) == 0
     assert device.next_sample == START + MS
     device.advance(START + 10 * MS)
-    device.receive(0, START + 12 * MS, 0.1)
-    device.receive(0, START + 500 * MS, 0.2)
+    command(device, (12, 0.1), (500, 0.2))
     # Held for a while: what fell due meanwhile takes effect when time runs again.
     assert device.follow(START + 40 * MS, standing=True) == 0
     device.advance(START + 60 * MS)
@@ -201,8 +195,7 @@ def test_a_device_follows_a_clock_that_runs_stands_and_jumps():
 def test_time_that_was_not_simulated_is_no_silence():
     device = plant(time=0, fallback=Fallback(1.0, 'zero'))
     device.follow(START)
-    device.receive(0, START, 0.05)
-    device.advance(START + 10 * MS)
+    command(device, (0, 0.05), until=10)
     device.follow(5 * START, standing=True)
     device.advance(5 * START + 900 * MS)
     assert device.trips == 0

@@ -5,6 +5,7 @@ from threading import Event
 from time import monotonic_ns
 
 from conftest import wait_until
+from devices import advance, command, MS, START
 import numpy as np
 import pytest
 
@@ -14,8 +15,6 @@ from hmsa_ros.device.hardware import Calls, ClockMap, load
 from hmsa_ros.device.watchdog import Fallback, judge_hardware, Kind
 from hmsa_ros.device.worker import HardwareDevice, HardwareJoint, HardwareWorker
 
-MS = 1_000_000
-START = 1000 * MS
 TODAY = 1_800_000_000_000 * MS
 
 
@@ -56,16 +55,24 @@ def serve(*benches, period=0, reconnect=False, **calls):
     return worker
 
 
+def put(worker, joint, bench, level):
+    """Command a level, and wait until it is written."""
+    worker.receive(joint, 0, level)
+    wait_until(lambda: level in bench.levels, 'the level')
+
+
+def ended(worker):
+    """Wait until a worker has ended as it is looked after; return why."""
+    return wait_until(lambda: worker.look_after() or worker.failure, 'the end')
+
+
 def test_a_driver_writes_each_level_when_it_is_due():
     bench, device = driver()
     assert device.due is None
     for stamp, level in ((10, 0.1), (20, 0.2), (30, 0.3), (20, 0.25)):
         device.receive(0, START + stamp * MS, level)
     assert device.due == START + 10 * MS
-    device.advance(START + 9 * MS)
-    device.advance(START + 10 * MS)
-    device.advance(START + 21 * MS)
-    device.advance(START + 50 * MS)
+    advance(device, 9, 10, 21, 50)
     assert bench.writes[1:] == [(START + 10 * MS, 0.1), (START + 21 * MS, 0.25)]
     # What is reported is when the amplifier had done it.
     assert [(x.stamp, x.level) for x in device.changes()] == [
@@ -94,9 +101,7 @@ def test_a_driver_refuses_what_is_beyond_its_limit(level):
 
 def test_a_driver_switches_the_coil_off_after_a_silence():
     bench, device = driver()
-    device.receive(0, START + MS, 0.1)
-    device.receive(0, START + 3000 * MS, 0.3)
-    device.advance(START + MS)
+    command(device, (1, 0.1), (3000, 0.3), until=1)
     assert device.due == START + 1001 * MS + 1
     device.advance(device.due)
     assert bench.writes[1:] == [(START + MS, 0.1), (START + 1001 * MS + 1, 0.0)]
@@ -157,9 +162,7 @@ def test_a_sign_of_life_is_passed_on_unless_the_next_level_is_near():
     # What repeats is no change.
     assert [x.level for x in device.changes()] == [0.1]
     device.calls.longest['slow'] = 0.02
-    device.receive(0, START + 30 * MS, 0.2)
-    device.receive(0, START + 60 * MS, 0.2)
-    device.advance(START + 3 * MS)
+    command(device, (30, 0.2), (60, 0.2), until=3)
     assert bench.levels == [0.0, 0.1, 0.1]
     device.advance(START + 30 * MS)
     assert bench.levels == [0.0, 0.1, 0.1, 0.2]
@@ -234,8 +237,7 @@ NAN = math.nan
 def test_read_returns_what_is_new(readings, expected):
     amplifier, device = driver(period=MS, bench=Amplifier())
     amplifier.readings = readings
-    device.receive(0, START + 7 * MS, 0.1)
-    device.advance(START + 9 * MS)
+    command(device, (7, 0.1), until=9)
     samples = device.samples()
     assert [((x.time - START) / MS, x.stretch[0], x.rate[0]) for x in samples] == [
         tuple(pytest.approx(x, nan_ok=True) for x in each) for each in expected]
@@ -279,13 +281,7 @@ def test_what_read_yields_is_part_of_the_call():
     bench.read = lambda now: yielding(blocked, go)
     assert blocked.wait(60.0)
     worker.receive(0, 0, 0.1)
-
-    def ended():
-        worker.look_after()
-        return worker.failure
-
-    wait_until(ended, 'the end')
-    assert 'Bench.read of joint joint_0 has not returned for 0.01 s' in str(worker.failure)
+    assert 'Bench.read of joint joint_0 has not returned for 0.01 s' in str(ended(worker))
     assert bench.levels[-1] == 0.0
     go.set()
     worker.close()
@@ -294,8 +290,7 @@ def test_what_read_yields_is_part_of_the_call():
 def test_hardware_that_has_lost_its_state_begins_without_a_field():
     bench, device = driver()
     device.receive(0, 0, 0.1)
-    device.receive(0, START + 5 * MS, 0.2)
-    device.advance(START + MS)
+    command(device, (5, 0.2), until=1)
     taken = bench.write
 
     def write(level, now):
@@ -384,6 +379,12 @@ def step(board, device, time):
     device.advance(time)
 
 
+def steps(board, device, begin, end, by=1):
+    """Step each so many ms from a time in ms to another."""
+    for k in range(begin, end, by):
+        step(board, device, START + k * MS)
+
+
 def test_a_device_that_keeps_time_gets_levels_ahead_and_says_when_they_took_effect():
     board, device = board_driver()
     for stamp, level in ((50, 0.1), (60, 0.2), (70, 0.3), (60, 0.25)):
@@ -393,8 +394,7 @@ def test_a_device_that_keeps_time_gets_levels_ahead_and_says_when_they_took_effe
     assert board.calls[1:] == [('schedule', [x]) for x in (0.1, 0.2, 0.3, 0.25)]
     # Nothing is watched for, since the board keeps the time.
     assert device.next_level is None
-    for k in range(3, 100):
-        step(board, device, START + k * MS)
+    steps(board, device, 3, 100)
     changes = device.changes()
     assert [x.level for x in changes] == [0.1, 0.25]
     for x, due in zip(changes, (50, 60), strict=True):
@@ -421,8 +421,7 @@ def test_the_level_in_force_takes_back_what_a_device_keeps_also_if_it_comes_late
         step(board, device, START + 2 * MS)
     step(board, device, START + 20 * MS)
     device.receive(0, START + (20 - late) * MS, 0.1)
-    for k in range(20, 600):
-        step(board, device, START + k * MS)
+    steps(board, device, 20, 600)
     assert board.kept == []
     assert [x.level for x in device.changes()] == pytest.approx([0.1])
 
@@ -445,8 +444,7 @@ def test_a_device_that_is_slow_to_answer_is_not_given_levels_again_that_are_past
 def test_a_level_is_replaced_at_its_own_time_though_the_clock_is_known_better_by_then():
     board, device = board_driver()
     device.receive(0, START + 3000 * MS, 0.1)
-    for k in range(2, 2000, 5):
-        step(board, device, START + k * MS)
+    steps(board, device, 2, 2000, 5)
     (first,) = board.kept
     device.receive(0, START + 3000 * MS, 0.2)
     step(board, device, START + 2001 * MS)
@@ -472,8 +470,7 @@ def test_a_device_with_little_room_gets_levels_as_it_has_room():
 
 def test_samples_of_a_device_with_a_clock_are_stamped_in_the_time_of_the_host():
     board, device = board_driver(period=10 * MS)
-    for k in range(2, 2000, 5):
-        step(board, device, START + k * MS)
+    steps(board, device, 2, 2000, 5)
     samples = device.samples()
     assert len(samples) > 190
     errors = np.array([x.time for x in samples]) - np.array(board.exposed)
@@ -500,19 +497,16 @@ def test_a_clock_that_answers_at_once_is_known_by_later_answers_that_take_longer
 def test_a_board_whose_clock_begins_anew_has_lost_its_state():
     board, device = board_driver()
     device.receive(0, START + 50 * MS, 0.2)
-    for k in range(2, 100):
-        step(board, device, START + k * MS)
+    steps(board, device, 2, 100)
     board.begun, board.kept, board.level = START + 99 * MS, [], 0.0
-    for k in range(100, 1200):
-        step(board, device, START + k * MS)
+    steps(board, device, 100, 1200)
     (notice,) = device.notices()
     assert (notice.kind, device.coils[0].level) == (Kind.LOST, 0.0)
     assert 'its clock is another one' in notice.text
     # It goes on by the new clock.
     device.receive(0, device.guards[0].cut_off_time, 0.0)
     device.receive(0, START + 1300 * MS, 0.1)
-    for k in range(1201, 1400):
-        step(board, device, START + k * MS)
+    steps(board, device, 1201, 1400)
     stamp = device.changes()[-1].stamp
     assert abs(stamp - START - 1300 * MS) < 50_000
 
@@ -521,39 +515,29 @@ def test_a_board_whose_clock_begins_anew_has_lost_its_state():
     ({'applied': lambda self: []}, 'does not report that 0.2 T took effect'),
     ({'applied': lambda self: [1]}, 'expected a list of'),
     ({'applied': lambda self: [(10**30, 0.2)]}, 'expected a list of'),
-    ({'schedule': lambda self, levels: 1 / 0}, 'schedule of joint actuator raised ZeroDivision'),
-])
+    ({'schedule': lambda self, levels: 1 / 0}, 'schedule of joint actuator raised ZeroDivision')])
 def test_a_device_that_does_not_keep_levels_as_it_should_is_said_to(changes, expected):
     board, device = board_driver(**changes)
     device.receive(0, START + 10 * MS, 0.2)
-
-    def go_on():
-        for k in range(2, 3000, 5):
-            step(board, device, START + k * MS)
-
     with pytest.raises(HmsaError, match=expected):
-        go_on()
+        steps(board, device, 2, 3000, 5)
     assert device.switch_off(START + 3000 * MS) == ''
 
 
 def test_a_clock_is_asked_on_when_that_of_the_host_has_been_set_back():
     board, device = board_driver()
-    for k in range(2, 500):
-        step(board, device, START + k * MS)
+    steps(board, device, 2, 500)
     asked = board.asked
     board.host -= 400 * MS
-    for k in range(100, 400):
-        step(board, device, START + k * MS)
+    steps(board, device, 100, 400)
     assert board.asked > asked
 
 
 @pytest.mark.parametrize('by', [240_000 * MS, -5_000 * MS])
 def test_when_the_clock_is_set_levels_ahead_and_the_watchdog_go_on(by):
     bench, device = driver(fallback=Fallback(0.1, 'zero'))
-    device.receive(0, START, 0.1)
-    device.advance(START)
-    device.receive(0, START + 50 * MS, 0.2)
-    device.advance(START + 10 * MS)
+    command(device, (0, 0.1), until=0)
+    command(device, (50, 0.2), until=10)
     device.clock_set(by)
     words = f'set {"ahead" if by > 0 else "back"} by {abs(by) / 1e9:.3f} s'
     assert [words in x.text for x in device.notices()] == [True]
@@ -575,8 +559,7 @@ def test_when_the_clock_is_set_levels_ahead_and_the_watchdog_go_on(by):
 @pytest.mark.parametrize('by', [240_000 * MS, -5_000 * MS])
 def test_a_device_that_keeps_time_is_the_same_when_the_clock_of_the_host_is_set(by):
     board, device = board_driver()
-    for k in range(2, 290):
-        step(board, device, START + k * MS)
+    steps(board, device, 2, 290)
     device.receive(0, START + 310 * MS, 0.1)
     step(board, device, START + 290 * MS)
     board.host += by
@@ -616,8 +599,7 @@ def test_a_worker_on_a_computer_that_was_suspended_cuts_its_coil_off(seconds):
         [HardwareJoint(bench, 0.5, Fallback(1.0, 'zero'))], time=clock(), calls=Calls(60.0)),
         clock, clock)
     assert worker.started(60.0)
-    worker.receive(0, 0, 0.1)
-    wait_until(lambda: bench.levels[-1] == 0.1, 'the level')
+    put(worker, 0, bench, 0.1)
     slept[0] = round(seconds * 1000) * MS
     if seconds > 1.0:
         # As the node does on its next tick.
@@ -773,8 +755,7 @@ def test_a_ramp_down_does_not_go_on_once_the_coil_is_off(end):
     bench, device = driver(
         bench=Warm(), temperature_limit=80.0, fallback=Fallback(0.01, 'ramp', 0.1))
     device.receive(0, 0, 0.05)
-    for time in (0, 11, 100):
-        device.advance(START + time * MS)
+    advance(device, 0, 11, 100)
     assert 0.0 < bench.levels[-1] < 0.05
     if end == 'switched off':
         device.switch_off(START + 101 * MS)
@@ -783,8 +764,7 @@ def test_a_ramp_down_does_not_go_on_once_the_coil_is_off(end):
     else:
         bench.degrees = 81.0
     # The temperature is asked for four times a second.
-    for time in range(260, 600):
-        device.advance(START + time * MS)
+    advance(device, *range(260, 600))
     # At the start, and once more.
     assert (bench.levels.count(0.0), bench.levels[-1]) == (2, 0.0)
     # Nor does what was commanded before, though it is repeated.
@@ -829,8 +809,7 @@ class Cable(Bench):
 def test_a_coil_that_could_not_be_switched_off_is_said_to_be_and_tried_until_it_is():
     cable = Cable()
     worker = serve(cable)
-    worker.receive(0, 0, 0.1)
-    wait_until(lambda: 0.1 in cable.levels, 'the level')
+    put(worker, 0, cable, 0.1)
     cable.out = cable.cut = True
     worker.receive(0, 0, 0.2)
     wait_until(lambda: worker.trouble, 'the trouble')
@@ -906,8 +885,7 @@ def test_a_worker_that_is_to_reconnect_ends_by_itself_only_for_errors_of_its_own
 def test_a_worker_that_is_ended_meanwhile_says_that_the_coil_was_not_switched_off():
     cable = Cable()
     worker = serve(cable)
-    worker.receive(0, 0, 0.1)
-    wait_until(lambda: 0.1 in cable.levels, 'the level')
+    put(worker, 0, cable, 0.1)
     cable.out = True
     worker.close()
     assert 'the coil was NOT switched off and may be on' in str(worker.failure)
@@ -956,19 +934,13 @@ def test_nobody_waits_for_a_call_that_blocks_and_then_only_the_newest_level_is_w
 def test_a_call_that_does_not_return_in_time_ends_the_worker_from_another_thread(method):
     gate, other = Gate(), Bench()
     worker = serve(gate, other, period=MS, limit=0.01)
-    worker.receive(1, 0, 0.3)
-    wait_until(lambda: 0.3 in other.levels, 'the level')
+    put(worker, 1, other, 0.3)
     gate.blocks = method
     worker.receive(0, 0, 0.1)
     assert gate.blocked.wait(60.0)
-
-    def ended():
-        worker.look_after()
-        return worker.failure
-
-    wait_until(ended, 'the end')
-    assert f'Gate.{method} of joint joint_0 has not returned for 0.01 s' in str(worker.failure)
-    assert 'the coil is switched off from another thread' in str(worker.failure)
+    said = str(ended(worker))
+    assert f'Gate.{method} of joint joint_0 has not returned for 0.01 s' in said
+    assert 'the coil is switched off from another thread' in said
     assert [x.levels[-1] for x in (gate, other)] == [0.0, 0.0]
     gate.go.set()
     worker.close()
