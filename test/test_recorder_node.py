@@ -25,12 +25,25 @@ from hmsa.bag.qos import Qos
 from hmsa.bag.reader import BagReader, read_messages
 from hmsa.bag.writer import BagTopic, BagWriter, recover
 from hmsa.cli import main
+from hmsa.interfaces import topics
 from hmsa.model.units import NANOSECONDS
 from hmsa_ros.nodes.capture import RawSubscription
 from hmsa_ros.nodes.recorder import Recorder as Recording
 
 pytestmark = pytest.mark.ros
 TALKER = Path(__file__).parent / 'talker.py'
+
+
+def send(publisher, *values):
+    for value in values:
+        publisher.publish(Float64(data=float(value)))
+
+
+def read_by_rosbags(folder):
+    """Return the values of a bag as rosbags reads them."""
+    with needs('rosbags.highlevel').AnyReader([folder]) as reader:
+        return [reader.deserialize(data, connection.msgtype).data
+                for connection, _, data in reader.messages()]
 
 
 class Recorder:
@@ -57,6 +70,11 @@ class Recorder:
 
     def wait_for(self, key, value):
         self.ros.spin_until(lambda: self.says(key) == value, f'{key} = {value} of the recorder')
+
+    def hear(self, publisher, *values, received):
+        """Publish values, and wait until so many messages are received."""
+        send(publisher, *values)
+        self.wait_for('received', str(received))
 
     def call(self, name):
         return self.ros.call(Trigger, f'recorder/{name}')
@@ -104,9 +122,7 @@ def test_everything_sent_is_in_the_bag_after_a_clean_end(record, talk, ending):
     assert stored.message_count == 2000
     assert missing_messages(stored.custom_data, 'lost') == {'/a': 0}
     assert '2000 messages of 1 topics' in recorder.process.stdout
-    with needs('rosbags.highlevel').AnyReader([recorder.folder]) as other:
-        assert [other.deserialize(data, connection.msgtype).data
-                for connection, _, data in other.messages()] == list(range(2000))
+    assert read_by_rosbags(recorder.folder) == list(range(2000))
 
 
 @pytest.mark.slow
@@ -124,12 +140,10 @@ def test_it_says_when_every_topic_asked_for_is_subscribed_to(record, ros):
 def test_lost_messages_are_counted_to_the_last_one(record, ros):
     recorder = record('record.queue_depth:=5')
     publisher = ros.publisher(Float64, '/a', 2000)
-    publisher.publish(Float64(data=-1.0))
-    recorder.wait_for('received', '1')
+    recorder.hear(publisher, -1.0, received=1)
     # While the recorder does not run, all but the last few are overwritten in its queue.
     recorder.process.popen.send_signal(signal.SIGSTOP)
-    for i in range(1000):
-        publisher.publish(Float64(data=float(i)))
+    send(publisher, *range(1000))
     recorder.process.popen.send_signal(signal.SIGCONT)
     ros.spin_until(lambda: int(recorder.says('received')) + int(recorder.says('lost')) == 1001,
                    'all 1001 messages to be received or counted as lost')
@@ -145,13 +159,10 @@ def test_lost_messages_are_counted_to_the_last_one(record, ros):
 
 def test_what_was_sent_before_it_was_matched_is_counted_apart(record, ros):
     publisher = ros.publisher(Float64, '/a', 100, subscribers=0)
-    for i in range(20):
-        publisher.publish(Float64(data=float(i)))
+    send(publisher, *range(20))
     recorder = record(topics='[/a, /b]')
     ros.spin_until(lambda: publisher.get_subscription_count() == 1, 'the recorder')
-    for i in range(20, 25):
-        publisher.publish(Float64(data=float(i)))
-    recorder.wait_for('received', '5')
+    recorder.hear(publisher, *range(20, 25), received=5)
     recorder.wait_for('sent_before./a', '20')
     reader = recorder.end()
     assert values(reader) == [20.0, 21.0, 22.0, 23.0, 24.0]
@@ -166,8 +177,7 @@ def test_what_was_sent_before_it_was_matched_is_counted_apart(record, ros):
 def test_a_topic_of_which_nothing_came_is_named_by_the_recorder_and_by_its_bag(record, ros):
     recorder = record('record.regex:=^/a', topics='')
     publishers = [ros.publisher(Float64, x) for x in ('/a1', '/a2')]
-    publishers[0].publish(Float64(data=1.0))
-    recorder.wait_for('received', '1')
+    recorder.hear(publishers[0], 1.0, received=1)
     reader = recorder.end()
     assert reader.counts() == {'/a1': 1, '/a2': 0}
     assert 'no message was received on /a2' in recorder.process.stdout
@@ -192,16 +202,13 @@ def test_several_publishers_of_one_topic_are_counted_apart(record, start):
 def test_a_bag_is_recovered_after_kill_9(record, ros, tmp_path):
     recorder = record('storage.flush_period:=0.1')
     publisher = ros.publisher(Float64, '/a')
-    for i in range(500):
-        publisher.publish(Float64(data=float(i)))
+    send(publisher, *range(500))
     recorder.wait_for('written', '500')
     assert recorder.process.stop(signal.SIGKILL) == -signal.SIGKILL
     assert metadata.read(recorder.folder / 'metadata.yaml').version == 9
     result = recover(recorder.folder, tmp_path / 'recovered')
     assert result.message_count == 500
-    with needs('rosbags.highlevel').AnyReader([tmp_path / 'recovered']) as other:
-        assert [other.deserialize(data, connection.msgtype).data
-                for connection, _, data in other.messages()] == list(range(500))
+    assert read_by_rosbags(tmp_path / 'recovered') == list(range(500))
 
 
 @pytest.fixture
@@ -229,7 +236,7 @@ def test_a_full_disk_is_told_and_nothing_is_lost_when_there_is_room_again(
         nonlocal sent
         if not condition():
             for _ in range(20):
-                publisher.publish(Float64(data=float(sent)))
+                send(publisher, sent)
                 sent += 1
         return condition()
 
@@ -240,14 +247,12 @@ def test_a_full_disk_is_told_and_nothing_is_lost_when_there_is_room_again(
 
     ros.spin_until(lambda: send(failing), 'the disk to be full')
     assert 'No space left on device' in recorder.process.output
-    with needs('rosbags.highlevel').AnyReader([small_disk / 'bag']) as other:
-        so_far = [other.deserialize(data, connection.msgtype).data
-                  for connection, _, data in other.messages()]
+    so_far = read_by_rosbags(small_disk / 'bag')
     assert so_far == list(range(len(so_far)))
     assert len(so_far) > 1000
     (small_disk / 'filler').unlink()
     recorder.process.wait_for_output('recording continues in bag_1.mcap')
-    publisher.publish(Float64(data=float(sent)))
+    send(publisher, sent)
     recorder.wait_for('written', str(sent + 1))
     reader = recorder.end()
     assert values(reader) == list(range(sent + 1))
@@ -268,8 +273,7 @@ def test_an_existing_folder_is_refused_in_one_line(ros_env, handlers, tmp_path, 
     ('storage.custom_data:=[a]', 'expected key=value'),
     ('storage.max_bagfile_size:=10', 'at least 1024'),
     ('record.regex:="("', 'expected a regular expression'),
-    ('record.topics:=3', 'expected a list of strings'),
-])
+    ('record.topics:=3', 'expected a list of strings')])
 def test_bad_parameters_are_refused_in_one_line(
         ros_env, handlers, tmp_path, capfd, parameter, expected):
     assert main(['recorder', '--ros-args', '-p', f'storage.uri:={tmp_path / "bag"}',
@@ -298,11 +302,9 @@ def test_a_publisher_that_asks_for_less_is_heard_after_one_that_offered_more(
     recorder = record()
     other = make_ros()
     reliable = other.publisher(Float64, '/a')
-    reliable.publish(Float64(data=-1.0))
-    recorder.wait_for('received', '1')
+    recorder.hear(reliable, -1.0, received=1)
     talk('/a', 100, '--best-effort', '--rate', 500)
-    reliable.publish(Float64(data=-2.0))
-    recorder.wait_for('received', '102')
+    recorder.hear(reliable, -2.0, received=102)
     reader = recorder.end()
     assert values(reader) == [-1.0, *range(100), -2.0]
     assert {profile.reliability for profile in reader.topics['/a'].profiles} == {
@@ -316,7 +318,7 @@ def test_topics_are_chosen_by_expression_and_exclusion(record, ros):
     late = ros.publisher(Float64, '/x2')
     ros.spin_until(publishers['/x1'].get_subscription_count, 'a subscriber of /x1')
     for publisher in (*publishers.values(), late):
-        publisher.publish(Float64(data=1.0))
+        send(publisher, 1.0)
     recorder.wait_for('received', '2')
     assert recorder.end().counts() == {'/x1': 1, '/x2': 1}
 
@@ -335,20 +337,18 @@ def test_without_a_selection_every_topic_is_recorded(record, ros):
 def test_pause_and_resume(record, ros):
     recorder = record('record.start_paused:=true')
     publisher = ros.publisher(Float64, '/a')
-    publisher.publish(Float64(data=1.0))
+    send(publisher, 1.0)
     assert recorder.call('is_paused').success
     assert recorder.call('resume').success
     assert not recorder.call('is_paused').success
-    publisher.publish(Float64(data=2.0))
-    recorder.wait_for('received', '1')
+    recorder.hear(publisher, 2.0, received=1)
     assert recorder.call('pause').message == 'paused'
-    publisher.publish(Float64(data=3.0))
+    send(publisher, 3.0)
     # Several rounds of the diagnostics later it would have been counted.
     before = len(recorder.diagnostics)
     ros.spin_until(lambda: len(recorder.diagnostics) > before + 1, 'diagnostics')
     recorder.call('resume')
-    publisher.publish(Float64(data=4.0))
-    recorder.wait_for('received', '2')
+    recorder.hear(publisher, 4.0, received=2)
     reader = recorder.end()
     assert values(reader) == [2.0, 4.0]
     assert missing_messages(reader.custom_data, 'lost') == {'/a': 0}
@@ -358,22 +358,18 @@ def test_files_are_split_by_service_and_by_size(record, ros):
     recorder = record('storage.max_bagfile_size:=4096')
     publisher = ros.publisher(Float64, '/a')
     assert recorder.call('split_bagfile').message == 'bag_1.mcap'
-    for i in range(1000):
-        publisher.publish(Float64(data=float(i)))
-    recorder.wait_for('received', '1000')
+    recorder.hear(publisher, *range(1000), received=1000)
     reader = recorder.end()
     assert len(reader.files) > 5
     assert values(reader) == list(range(1000))
     stored = metadata.read(recorder.folder / 'metadata.yaml')
     assert sum(file.message_count for file in stored.files) == 1000
-    with needs('rosbags.highlevel').AnyReader([recorder.folder]) as other:
-        assert sum(1 for _ in other.messages()) == 1000
+    assert read_by_rosbags(recorder.folder) == list(range(1000))
 
 
 def test_garbage_on_the_clock_is_left_aside(record, ros):
     recorder = record('use_sim_time:=true')
-    clock = ros.node.create_publisher(
-        Clock, '/clock', QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
+    clock = ros.publisher(topics.CLOCK_TOPIC, subscribers=0)
     message = Clock()
     message.clock.sec = 100
 
@@ -394,19 +390,17 @@ def test_garbage_on_the_clock_is_left_aside(record, ros):
         return publisher.get_subscription_count()
 
     ros.spin_until(ticks, 'the recorder to listen')
-    publisher.publish(Float64(data=1.0))
-    recorder.wait_for('received', '1')
+    recorder.hear(publisher, 1.0, received=1)
     assert values(recorder.end()) == [1.0]
 
 
 @pytest.mark.slow
 def test_simulated_time_is_waited_for_and_stamped(record, ros):
     recorder = record('use_sim_time:=true')
-    clock = ros.node.create_publisher(
-        Clock, '/clock', QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
+    clock = ros.publisher(topics.CLOCK_TOPIC, subscribers=0)
     publisher = ros.node.create_publisher(Float64, '/a', QoSProfile(
         depth=5, durability=DurabilityPolicy.TRANSIENT_LOCAL))
-    publisher.publish(Float64(data=1.0))
+    send(publisher, 1.0)
     recorder.wait_for('state', 'waiting for /clock')
     message = Clock()
     message.clock.sec = 100
@@ -419,13 +413,11 @@ def test_simulated_time_is_waited_for_and_stamped(record, ros):
     ros.spin_until(tick, 'the latched message')
     message.clock.sec = 200
     clock.publish(message)
-    publisher.publish(Float64(data=2.0))
-    recorder.wait_for('received', '2')
+    recorder.hear(publisher, 2.0, received=2)
     message.clock.sec = 50
     clock.publish(message)
     ros.spin_until((recorder.folder / 'bag_1.mcap').exists, 'a new file for the new time')
-    publisher.publish(Float64(data=3.0))
-    recorder.wait_for('received', '3')
+    recorder.hear(publisher, 3.0, received=3)
     recorder.wait_for('time_jumps', '1')
     reader = recorder.end()
     assert 'simulated time jumped back from 200.000 s to 50.000 s' in recorder.process.output
@@ -457,23 +449,26 @@ def test_a_bag_played_in_a_loop_is_recorded_round_by_round(record, start, ros, t
         assert values(BagReader(file)) == list(range(200))
 
 
+def in_process(folder):
+    """Return the arguments of a recorder in this process."""
+    return ('-p', f'storage.uri:={folder}', '-p', 'storage.flush_period:=0.1', '-p',
+            'record.topics:=[/a]')
+
+
 def test_a_clock_that_is_set_back_begins_a_file_whose_log_times_rise(
         ros, serve, tmp_path, monkeypatch):
     folder, set_back = tmp_path / 'bag', 0
-    served = serve(Recording, *(x for y in (
-        f'storage.uri:={folder}', 'storage.flush_period:=0.1', 'record.topics:=[/a]')
-        for x in ('-p', y)))
-    recorder = served.nodes[0]
+    recorder = serve(Recording, *in_process(folder)).nodes[0]
     take = RawSubscription.take
     monkeypatch.setattr(RawSubscription, 'take', lambda *limit: [
         x._replace(received_ns=x.received_ns - set_back) for x in take(*limit)])
     publisher = ros.publisher(Float64, '/a')
-    publisher.publish(Float64(data=1.0))
+    send(publisher, 1.0)
     ros.spin_until(lambda: recorder._recorded.topics['/a'].received == 1, 'the first message')
     # As if all readings so far had been ten seconds ahead, or the next ones behind.
     set_back = 10 * NANOSECONDS
     recorder._steps._clock = lambda: time.time_ns() - set_back
-    publisher.publish(Float64(data=2.0))
+    send(publisher, 2.0)
     ros.spin_until(lambda: recorder._recorded.topics['/a'].received == 2, 'the second message')
     recorder.close()
     reader = BagReader(folder)
@@ -485,11 +480,8 @@ def test_a_clock_that_is_set_back_begins_a_file_whose_log_times_rise(
 def test_what_comes_while_messages_are_taken_is_in_the_file_of_its_time(
         ros, serve, tmp_path, monkeypatch):
     folder = tmp_path / 'bag'
-    serve(Recording, *(x for y in (
-        f'storage.uri:={folder}', 'storage.flush_period:=0.1', 'record.topics:=[/a]',
-        'use_sim_time:=true') for x in ('-p', y)))
-    clock = ros.publisher(Clock, '/clock', QoSProfile(
-        depth=1, reliability=ReliabilityPolicy.BEST_EFFORT), subscribers=0)
+    serve(Recording, *in_process(folder), '-p', 'use_sim_time:=true')
+    clock = ros.publisher(topics.CLOCK_TOPIC, subscribers=0)
     publisher = ros.publisher(Float64, '/a', subscribers=0)
 
     def tick(seconds):
@@ -506,19 +498,18 @@ def test_what_comes_while_messages_are_taken_is_in_the_file_of_its_time(
         taken = take(subscription, *limit)
         if subscription.handle.get_topic_name() == '/clock' and not jumped:
             jumped.append(True)
-            for i in range(3000):
-                publisher.publish(Float64(data=float(i)))
+            send(publisher, *range(3000))
             tick(50)
             while not (new := take(subscription)):
                 pass
-            publisher.publish(Float64(data=-1.0))
+            send(publisher, -1.0)
             taken += new
         return taken
 
     def recorded():
         return [values(BagReader(x)) for x in sorted(folder.glob('*.mcap'))]
 
-    publisher.publish(Float64(data=-2.0))
+    send(publisher, -2.0)
     ros.spin_until(lambda: recorded() == [[-2.0]], 'the first message')
     monkeypatch.setattr(RawSubscription, 'take', late)
     tick(100)
@@ -545,7 +536,7 @@ def test_of_two_clocks_one_is_followed_and_that_is_told(record, ros, make_ros):
     ros.spin_until(lambda: tick() and publisher.get_subscription_count(), 'the other clock')
     assert any('2 publishers of /clock, the first one is followed' in status.message
                for message in recorder.diagnostics for status in message.status)
-    publisher.publish(Float64(data=1.0))
+    send(publisher, 1.0)
     ros.spin_until(lambda: tick() and recorder.says('received') == '1', 'the message')
     reader = recorder.end()
     assert len(reader.files) == 1
@@ -595,17 +586,15 @@ def test_it_records_while_it_is_active(record, ros):
     assert change(Transition.TRANSITION_CONFIGURE)
     publisher = ros.publisher(Float64, '/a')
     recorder.wait_for('state', 'inactive')
-    publisher.publish(Float64(data=1.0))
+    send(publisher, 1.0)
     assert not recorder.call('resume').success
     assert change(Transition.TRANSITION_ACTIVATE)
-    publisher.publish(Float64(data=2.0))
-    recorder.wait_for('received', '1')
+    recorder.hear(publisher, 2.0, received=1)
     assert change(Transition.TRANSITION_DEACTIVATE)
-    publisher.publish(Float64(data=3.0))
+    send(publisher, 3.0)
     recorder.wait_for('state', 'inactive')
     assert change(Transition.TRANSITION_ACTIVATE)
-    publisher.publish(Float64(data=4.0))
-    recorder.wait_for('received', '2')
+    recorder.hear(publisher, 4.0, received=2)
     assert change(Transition.TRANSITION_DEACTIVATE)
     assert change(Transition.TRANSITION_CLEANUP)
     reader = BagReader(recorder.folder)
@@ -620,11 +609,8 @@ def test_it_records_while_it_is_active(record, ros):
 def test_a_snapshot_holds_what_came_before_it(record, ros):
     recorder = record('record.snapshot_mode:=true')
     publisher = ros.publisher(Float64, '/a')
-    for i in range(50):
-        publisher.publish(Float64(data=float(i)))
-    recorder.wait_for('received', '50')
+    recorder.hear(publisher, *range(50), received=50)
     assert recorder.says('written') == '0'
     assert recorder.call('snapshot').message == '50 messages written'
-    publisher.publish(Float64(data=99.0))
-    recorder.wait_for('received', '51')
+    recorder.hear(publisher, 99.0, received=51)
     assert values(recorder.end()) == list(range(50))
