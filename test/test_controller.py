@@ -95,11 +95,8 @@ def test_a_plant_that_is_not_as_planned_fails_and_commands_of_others_are_obeyed(
         start, ros, tmp_path):
     file = tmp_path / 'own.yaml'
     file.write_text(PARAMETERS.format(mismatch=1.1))
-    diagnostics = ros.collect(
-        topics.DIAGNOSTICS.type, '/diagnostics', topics.DIAGNOSTICS.qos)
-    applied = ros.collect(
-        topics.FLUX_DENSITY_APPLIED.type, 'flux_density_applied',
-        topics.FLUX_DENSITY_APPLIED.qos)
+    diagnostics = ros.collect(topics.DIAGNOSTICS, '/diagnostics')
+    applied = ros.collect(topics.FLUX_DENSITY_APPLIED, 'flux_density_applied')
     start.hmsa('controller', '--ros-args', '--params-file', str(file))
     send = start.hmsa('send', '1.4:0.3', '--wait')
     assert send.wait(60.0) == 1, send.output
@@ -128,9 +125,9 @@ def test_a_plant_that_is_not_as_planned_fails_and_commands_of_others_are_obeyed(
 @pytest.mark.slow
 @pytest.mark.ros
 def test_a_plant_that_is_taken_away_is_missed_and_comes_back(start, ros):
-    statuses = ros.collect(topics.STATUS.type, 'planner/status', topics.STATUS.qos)
+    statuses = ros.collect(topics.STATUS, 'planner/status')
     start.hmsa('controller', '--ros-args', '-p', 'lead_time:=0.5')
-    setpoint = ros.publisher(Float64, 'planner/setpoint', topics.SETPOINT.qos)
+    setpoint = ros.publisher(topics.SETPOINT, 'planner/setpoint')
 
     def plant(*transitions):
         for x in transitions:

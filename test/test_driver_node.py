@@ -49,9 +49,7 @@ def test_driver_of_the_tutorial_keeps_the_contract_of_a_driver(start, ros):
     # Long enough for a busy machine to hear all commands before the first one applies.
     driver = start.hmsa(
         'driver', *BENCH, '-p', 'command_timeout:=3.0', PYTHONPATH=str(TUTORIALS))
-    command = ros.publisher(
-        topics.FLUX_DENSITY_COMMAND.type, topics.FLUX_DENSITY_COMMAND.name,
-        topics.FLUX_DENSITY_COMMAND.qos)
+    command = ros.publisher(topics.FLUX_DENSITY_COMMAND)
     ros.spin_until(lambda: applied and states, 'the level at the start')
     assert applied[0].magnetic_field.z == 0.0
     driver.wait_for_output(
@@ -81,13 +79,9 @@ def test_driver_of_the_tutorial_keeps_the_contract_of_a_driver(start, ros):
 @pytest.mark.ros
 @pytest.mark.parametrize('node', [('plant',), ('driver', *BENCH)])
 def test_receipts_tell_commands_that_came_too_late_from_those_that_apply(start, ros, node):
-    receipts = ros.collect(
-        topics.FLUX_DENSITY_RECEIVED.type, topics.FLUX_DENSITY_RECEIVED.name,
-        topics.FLUX_DENSITY_RECEIVED.qos)
+    receipts = ros.collect(topics.FLUX_DENSITY_RECEIVED)
     device = start.hmsa(*node, PYTHONPATH=str(TUTORIALS))
-    command = ros.publisher(
-        topics.FLUX_DENSITY_COMMAND.type, topics.FLUX_DENSITY_COMMAND.name,
-        topics.FLUX_DENSITY_COMMAND.qos)
+    command = ros.publisher(topics.FLUX_DENSITY_COMMAND)
     ros.spin_until(lambda: receipts and command.get_subscription_count(), 'the first receipt')
     for ahead, said in ((0.0, ''), (-1.0, 'late'), (0.5, '')):
         stamp = ros.node.get_clock().now().nanoseconds + round(ahead * SECOND)
@@ -105,9 +99,7 @@ def test_hardware_that_breaks_ends_the_driver_with_all_coils_switched_off(start,
     driver = start(
         'sh', '-c', 'cd "$0" && exec "$@"', tmp_path, sys.executable, '-m', 'hmsa_ros',
         'driver', '--ros-args', '-p', 'hardware:=lab:Coil', '-p', 'publish_rate:=20.0')
-    command = ros.publisher(
-        topics.FLUX_DENSITY_COMMAND.type, topics.FLUX_DENSITY_COMMAND.name,
-        topics.FLUX_DENSITY_COMMAND.qos)
+    command = ros.publisher(topics.FLUX_DENSITY_COMMAND)
     ros.spin_until(lambda: applied, 'the level at the start')
     command.publish(to_command(0, 0.25, 'coil'))
     assert driver.wait() == 1

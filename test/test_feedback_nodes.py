@@ -21,15 +21,15 @@ PLANT = ('--ros-args', '-p', 'mismatch.shear_modulus:=1.2', '-p', 'stretch_noise
 
 def begin(start, ros, mode, *more):
     """Start both and wait for them; return a function of the newest message and its values."""
-    statuses = ros.collect(topics.STATUS.type, 'planner/status', topics.STATUS.qos)
-    samples = ros.collect(topics.JOINT_STATES.type, 'joint_states', topics.JOINT_STATES.qos)
+    statuses = ros.collect(topics.STATUS, 'planner/status')
+    samples = ros.collect(topics.JOINT_STATES, 'joint_states')
     # In slow motion, with commands far enough ahead for a busy machine.
     start.hmsa('plant', *PLANT, '-p', 'publish_clock:=true', '-p', 'real_time_factor:=0.15')
     start.hmsa(
         'planner', '--ros-args', '-p', f'feedback:={mode}', '-p', 'use_sim_time:=true', '-p',
         'lead_time:=0.3', *more)
     ros.spin_until(lambda: statuses and samples, 'planner and plant', RUN_SECONDS)
-    found = ros.collect(topics.ESTIMATE.type, 'planner/estimate', topics.ESTIMATE.qos)
+    found = ros.collect(topics.ESTIMATE, 'planner/estimate')
 
     def read():
         if not found:

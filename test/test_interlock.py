@@ -253,17 +253,15 @@ class Coil:
 def test_a_required_interlock_wins_over_everything(command, start, ros, tmp_path):
     (tmp_path / 'lab.py').write_text(BENCH)
     health = ros.collect(topics.DIAGNOSTICS.type, topics.DIAGNOSTICS.name)
-    status = ros.collect(topics.STATUS.type, 'planner/status', topics.STATUS.qos)
-    applied = ros.collect(
-        topics.FLUX_DENSITY_APPLIED.type, topics.FLUX_DENSITY_APPLIED.name,
-        topics.FLUX_DENSITY_APPLIED.qos)
+    status = ros.collect(topics.STATUS, 'planner/status')
+    applied = ros.collect(topics.FLUX_DENSITY_APPLIED)
     node = start.hmsa(
         command, '--ros-args', '-p', 'hardware:=lab:Coil', '-p', 'interlock_required:=true',
         '-p', 'interlock_timeout:=2.0', '-p', 'publish_rate:=0.0', PYTHONPATH=str(tmp_path))
     if command == 'driver':
         start.hmsa('planner')
-    door = ros.publisher(topics.INTERLOCK.type, 'driver/interlock', topics.INTERLOCK.qos)
-    setpoint = ros.publisher(topics.SETPOINT.type, 'planner/setpoint', topics.SETPOINT.qos)
+    door = ros.publisher(topics.INTERLOCK, 'driver/interlock')
+    setpoint = ros.publisher(topics.SETPOINT, 'planner/setpoint')
 
     def says(text):
         return any(x.message.startswith(text) for y in health[-20:] for x in y.status
@@ -303,7 +301,7 @@ def test_an_interlock_stays_open_while_a_driver_is_configured_anew(start, ros, t
     start.hmsa(
         'driver', '--ros-args', '-p', 'hardware:=lab:Coil', '-p', 'publish_rate:=0.0',
         PYTHONPATH=str(tmp_path))
-    door = ros.publisher(topics.INTERLOCK.type, 'driver/interlock', topics.INTERLOCK.qos)
+    door = ros.publisher(topics.INTERLOCK, 'driver/interlock')
 
     def shown():
         return [x.message for y in health[-1:] for x in y.status if x.name == 'driver: interlock']

@@ -174,8 +174,7 @@ def test_plant_shows_its_state_only_while_somebody_looks(ros, serve):
     sent = []
     publish = publisher.publish
     publisher.publish = lambda message: (sent.append(1), publish(message))
-    states = ros.collect(
-        topics.JOINT_STATES.type, 'joint_states', topics.JOINT_STATES.qos)
+    states = ros.collect(topics.JOINT_STATES, 'joint_states')
     ros.spin_until(lambda: len(states) > 200, 'time to run')
     assert not sent
     arrays = collected(ros, 'plant')
@@ -194,8 +193,7 @@ def test_planner_shows_its_target_and_plant_reaches_it_each_joint_in_its_place(r
     serve(PlantNode, PlannerNode, '-p', 'joints:=[left, right]', '-p',
           'right.actuator.half_length:=0.005')
     shown, targets = collected(ros, 'plant'), collected(ros, 'planner')
-    setpoint = ros.publisher(
-        topics.SETPOINT.type, '/planner/right/setpoint', topics.SETPOINT.qos)
+    setpoint = ros.publisher(topics.SETPOINT, '/planner/right/setpoint')
     setpoint.publish(Float64(data=1.1))
 
     def reached():
@@ -218,8 +216,7 @@ def test_rate_zero_shows_nothing(ros, serve):
     from hmsa_ros.nodes.plant import PlantNode
     serve(PlantNode, '-p', 'marker_rate:=0.0')
     arrays = collected(ros, 'plant')
-    states = ros.collect(
-        topics.JOINT_STATES.type, 'joint_states', topics.JOINT_STATES.qos)
+    states = ros.collect(topics.JOINT_STATES, 'joint_states')
     ros.spin_until(lambda: len(states) > 300, 'time to run')
     assert not arrays
 

@@ -188,9 +188,7 @@ def test_nodes_import_nothing_while_they_move_an_actuator_and_judge(ros, start):
     controller = start.python(
         '-c', LATE_IMPORTS, 'controller', '--ros-args', '-p', 'feedback:=cautious',
         '-p', 'publish_rate:=1000.0', '-p', 'mismatch.shear_modulus:=0.95')
-    markers = ros.collect(
-        topics.MARKERS.type, topics.from_outside(topics.MARKERS.name, 'plant'),
-        topics.MARKERS.qos)
+    markers = ros.collect(topics.MARKERS, topics.from_outside(topics.MARKERS.name, 'plant'))
     send = start.hmsa('send', '1.1:0.3', '1.2:0.3', '1.0:0.3', '--wait', '--timeout', '60')
     send.wait()
     assert 'accepted' in send.output

@@ -10,9 +10,7 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 import pytest
 from rclpy.parameter import Parameter
-from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
-from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
@@ -119,11 +117,9 @@ class Rig:
         self.served = served
         self.planner = served.nodes[0]
         self.drivers = {x: Driver(ros, x, joints) for x in joints}
-        self.statuses = ros.collect(
-            topics.STATUS.type, 'planner/status', topics.STATUS.qos)
-        self.plans = ros.collect(topics.PLAN.type, 'planner/plan', topics.PLAN.qos)
-        self.trajectories = ros.publisher(
-            JointTrajectory, 'planner/joint_trajectory', topics.JOINT_TRAJECTORY.qos)
+        self.statuses = ros.collect(topics.STATUS, 'planner/status')
+        self.plans = ros.collect(topics.PLAN, 'planner/plan')
+        self.trajectories = ros.publisher(topics.JOINT_TRAJECTORY, 'planner/joint_trajectory')
         channels = self.planner._channels.values()
         ros.spin_until(
             lambda: all(x._command.get_subscription_count() for x in channels)
@@ -251,8 +247,7 @@ def test_some_joints_only_by_parameter_and_one_by_its_own_setpoint(rig):
     groups = planner.runtime.group.planners
     assert not groups['left'].plan.segments
     assert groups['right'].plan.segments[0].arrival == groups['top'].plan.segments[0].arrival
-    setpoints = planner.ros.publisher(
-        Float64, 'planner/left/setpoint', topics.SETPOINT.qos)
+    setpoints = planner.ros.publisher(topics.SETPOINT, 'planner/left/setpoint')
     setpoints.publish(Float64(data=1.3))
     planner.verdict(code='accepted', request='', plan=2)
     assert groups['left'].plan.segments[0].stretch == 1.3
@@ -271,7 +266,7 @@ def test_first_request_waits_for_the_state_in_force(rig, ros):
     driver = planner.driver
     driver.plant.set_state(1.15, 3.0, 0.06)
     planner.trajectories.publish(to_trajectory([(1.3, SPELL)], 'actuator'))
-    setpoints = ros.publisher(Float64, 'planner/setpoint', topics.SETPOINT.qos)
+    setpoints = ros.publisher(topics.SETPOINT, 'planner/setpoint')
     # Somebody publishes samples: the planner asks for one, and this request waits its turn.
     ros.spin_until(lambda: samples.get_subscription_count() > 1, 'the subscription')
     setpoints.publish(Float64(data=1.25))
@@ -304,11 +299,10 @@ def test_first_request_waits_for_the_state_in_force(rig, ros):
 @pytest.mark.slow
 def test_planner_that_is_killed_is_followed_by_one_that_takes_over(ros, start, make_clock):
     arguments = ('planner', '--ros-args', *QUIET)
-    clock = ros.node.create_publisher(
-        Clock, '/clock', QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
+    clock = ros.publisher(topics.CLOCK_TOPIC, subscribers=0)
     samples = ros_entities.publisher(ros.node, topics.JOINT_STATES)
     setpoints = ros_entities.publisher(ros.node, topics.SETPOINT, topics.PLANNER)
-    statuses = ros.collect(topics.STATUS.type, 'planner/status', topics.STATUS.qos)
+    statuses = ros.collect(topics.STATUS, 'planner/status')
     driver = Driver(ros)
     now = START
 
@@ -507,12 +501,10 @@ def test_changed_block_and_lead_time_are_taken_by_the_next_plan(rig):
 
 def test_two_clocks_are_told_of_and_their_quarrel_makes_no_storm(rig, make_ros):
     planner = rig()
-    arrays = planner.ros.collect(
-        topics.DIAGNOSTICS.type, '/diagnostics', topics.DIAGNOSTICS.qos)
+    arrays = planner.ros.collect(topics.DIAGNOSTICS, '/diagnostics')
     planner.send(to_trajectory(SEQUENCE, 'actuator'))
     other = make_ros()
-    clock = other.publisher(
-        Clock, '/clock', QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
+    clock = other.publisher(topics.CLOCK_TOPIC)
     before = len(planner.statuses)
     for k in range(20):
         jumps = planner.runtime.clock_jumps
@@ -561,8 +553,8 @@ def test_step_of_the_wall_clock_is_noticed():
 def test_the_plan_goes_on_when_the_wall_clock_is_set_back(ros, serve):
     served = serve(PlannerNode)
     planner = served.nodes[0]
-    statuses = ros.collect(topics.STATUS.type, 'planner/status', topics.STATUS.qos)
-    setpoints = ros.publisher(Float64, 'planner/setpoint', topics.SETPOINT.qos)
+    statuses = ros.collect(topics.STATUS, 'planner/status')
+    setpoints = ros.publisher(topics.SETPOINT, 'planner/setpoint')
     setpoints.publish(Float64(data=1.1))
     ros.spin_until(
         lambda: statuses and statuses[-1].values[0].value == 'accepted', 'the plan')

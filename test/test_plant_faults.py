@@ -38,8 +38,7 @@ class Stand:
         self.samples = ros.collect(topics.JOINT_STATES.type, topics.JOINT_STATES.name, EVERY)
         applied = topics.FLUX_DENSITY_APPLIED
         self.applied = ros.collect(applied.type, applied.name, applied.qos)
-        self.reports = ros.collect(
-            topics.DIAGNOSTICS.type, topics.DIAGNOSTICS.name, topics.DIAGNOSTICS.qos)
+        self.reports = ros.collect(topics.DIAGNOSTICS)
         command = topics.FLUX_DENSITY_COMMAND
         self.publisher = ros.publisher(command.type, command.name, command.qos, subscribers)
         ros.spin_until(lambda: self.applied, 'the level at the start')

@@ -24,11 +24,9 @@ LEADING = ('-p', 'publish_clock:=true', '-p', 'start_paused:=true')
 def test_each_joint_has_topics_parameters_and_a_motion_of_its_own(ros, serve):
     serve(PlantNode, *LEADING, '-p', 'joints:=[left, right, middle]', '-p',
           'left.initial_stretch:=1.1', '-p', 'right.slew_limit:=20.0')
-    samples = ros.collect(
-        topics.JOINT_STATES.type, 'joint_states', QoSProfile(depth=100_000))
-    told = {x: ros.collect(
-        topics.FLUX_DENSITY_APPLIED.type, f'{x}/flux_density_applied',
-        topics.FLUX_DENSITY_APPLIED.qos) for x in ('left', 'right', 'middle')}
+    samples = ros.collect(topics.JOINT_STATES, qos=QoSProfile(depth=100_000))
+    told = {x: ros.collect(topics.FLUX_DENSITY_APPLIED, f'{x}/flux_density_applied')
+            for x in ('left', 'right', 'middle')}
     plants = {
         'left': ActuatorSimulation(paper_actuator(), time=START, stretch=1.1),
         'right': ActuatorSimulation(paper_actuator(), time=START, slew_limit=20.0),

@@ -352,8 +352,7 @@ def test_following_plant_tells_of_two_clocks_and_of_one_again(following, make_ro
     clock.set(START)
     plant.wait(START)
     other = make_ros()
-    second = other.publisher(
-        topics.CLOCK_TOPIC.type, topics.CLOCK_TOPIC.name, topics.CLOCK_TOPIC.qos)
+    second = other.publisher(topics.CLOCK_TOPIC)
     plant.ros.spin_until(lambda: '2 publishers of /clock' in told(), 'two clocks')
     # Far behind: the simulation starts again, and goes on with whoever comes next.
 

@@ -82,7 +82,7 @@ def test_a_recorder_of_the_commands_does_not_carry_them_out(ros, serve, start):
     asking = Asking(ros)
     states.publish(JointState(name=['actuator'], position=[1.0]))
     asking.until(refused=False)
-    status = ros.collect(topics.STATUS.type, '/planner/status', topics.STATUS.qos)
+    status = ros.collect(topics.STATUS, '/planner/status')
     ros.spin_until(lambda: status and any(
         x.value.startswith('no node subscribes to /flux_density_command')
         for x in status[-1].values if x.key == 'unheard'), 'the planner says so')

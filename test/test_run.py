@@ -131,7 +131,7 @@ def test_a_block_arrives_and_stays_though_it_creeps(start, tmp_path, feedback):
 def test_an_interrupted_experiment_brings_the_running_actuator_to_rest(start, ros, tmp_path):
     from hmsa.interfaces import topics
 
-    statuses = ros.collect(topics.STATUS.type, 'planner/status', topics.STATUS.qos)
+    statuses = ros.collect(topics.STATUS, 'planner/status')
     # Far enough ahead for a busy machine, and no time passes where that stops the plant.
     nodes = [
         start.hmsa('plant', '--ros-args', '-p', 'publish_clock:=true'),
@@ -219,8 +219,7 @@ def test_a_simulated_experiment_with_feedback_arrives_and_records_what_is_believ
 def test_a_simulated_experiment_never_commands_nodes_that_run_already(start, ros, tmp_path):
     from hmsa.interfaces import topics
 
-    asked = ros.collect(
-        topics.JOINT_TRAJECTORY.type, 'planner/joint_trajectory', topics.JOINT_TRAJECTORY.qos)
+    asked = ros.collect(topics.JOINT_TRAJECTORY, 'planner/joint_trajectory')
     start.hmsa('plant')
     planner = start.hmsa('planner')
     ros.spin_until(lambda: 'planner' in ros.node.get_node_names() or not planner.alive(), 'it')

@@ -222,8 +222,7 @@ def test_policies_grant_exactly_what_the_nodes_do(tmp_path, start, ros):
         topics.DISTURBANCE_FORCE, topics.TEMPERATURE)]
     for topic in (topics.JOINT_TRAJECTORY, topics.SETPOINT):
         ros.publisher(topic.type, f'/planner/{topic.name[2:]}', topic.qos, subscribers=2)
-    requests = ros.publisher(
-        topics.SETPOINT.type, '/planner/setpoint', topics.SETPOINT.qos, subscribers=2)
+    requests = ros.publisher(topics.SETPOINT, '/planner/setpoint', subscribers=2)
     sent = [0.0]
 
     def looks_for_the_state() -> bool:
@@ -298,8 +297,7 @@ def test_policies_grant_exactly_what_a_sensor_does_beside_its_topic(start, ros):
 
 @pytest.mark.ros
 @pytest.mark.parametrize(('command', 'name', 'enclave'), [
-    (('send', '1.1:1', '--timeout', '60'), 'client', 'operator'),
-    (('watch',), 'watch', 'viewer'),
+    (('send', '1.1:1', '--timeout', '60'), 'client', 'operator'), (('watch',), 'watch', 'viewer'),
     *(pytest.param(('panel',), x, 'operator', marks=pytest.mark.slow)
       for x in ('client', 'watch'))])
 def test_commands_do_nothing_that_their_enclave_may_not(start, ros, command, name, enclave):

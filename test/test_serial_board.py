@@ -271,17 +271,15 @@ def test_a_board_whose_cable_is_pulled_switches_off_and_is_found_again(line):
 @pytest.mark.slow
 @pytest.mark.ros
 def test_a_driver_goes_on_after_a_pulled_cable_when_it_is_asked_to(start, ros, line):
-    applied = ros.collect(
-        topics.FLUX_DENSITY_APPLIED.type, topics.FLUX_DENSITY_APPLIED.name,
-        topics.FLUX_DENSITY_APPLIED.qos)
-    status = ros.collect(topics.STATUS.type, 'planner/status', topics.STATUS.qos)
+    applied = ros.collect(topics.FLUX_DENSITY_APPLIED)
+    status = ros.collect(topics.STATUS, 'planner/status')
     health = ros.collect(topics.DIAGNOSTICS.type, topics.DIAGNOSTICS.name)
     driver = start.hmsa('driver', '--ros-args', *(word for x in (
         'hardware:=serial_board', f'hardware.port:={line.path}', 'hardware.reconnect:=true',
         'publish_rate:=50.0', *(f'hardware.{key}:={x}' for key, x in SETTINGS.items()))
         for word in ('-p', x)))
     start.hmsa('planner')
-    setpoint = ros.publisher(topics.SETPOINT.type, 'planner/setpoint', topics.SETPOINT.qos)
+    setpoint = ros.publisher(topics.SETPOINT, 'planner/setpoint')
 
     ask = partial(ros.ask, setpoint, status)
 
@@ -333,8 +331,7 @@ def test_a_board_without_room_and_one_that_is_none_are_said(line, monkeypatch):
     (['coil.tesla_per_ampere=1'], "port is '': expected a serial port"),
     (['coil.tesla_per_ampere=1', 'port=/no/tty'], 'the line /no/tty failed'),
     (['coil.tesla_per_ampere=1', 'port=sim:/no/x.csv'], 'expected a file in a folder that exists'),
-    (['coil.tesla_per_ampere=1', 'port=sim', 'watchdog=-1'], 'watchdog is -1'),
-])
+    (['coil.tesla_per_ampere=1', 'port=sim', 'watchdog=-1'], 'watchdog is -1')])
 def test_a_board_that_cannot_be_had_is_refused_in_a_sentence(capsys, settings, expected):
     needs('serial')
     given = [x for setting in settings for x in ('--set', setting)]

@@ -31,16 +31,11 @@ def test_planner_without_coefficients_does_not_subscribe(serve, ros):
 
 def test_planner_plans_for_the_temperature_that_is_published(serve, ros):
     serve(PlannerNode, '-p', 'takeover_timeout:=0.0', *COEFFICIENTS)
-    commands = ros.collect(
-        topics.FLUX_DENSITY_COMMAND.type, topics.FLUX_DENSITY_COMMAND.name,
-        topics.FLUX_DENSITY_COMMAND.qos)
-    temperatures = ros.publisher(topics.TEMPERATURE.type, TOPIC, topics.TEMPERATURE.qos)
-    ros.publisher(
-        topics.FLUX_DENSITY_APPLIED.type, topics.FLUX_DENSITY_APPLIED.name,
-        topics.FLUX_DENSITY_APPLIED.qos)
-    diagnostics = ros.collect(
-        topics.DIAGNOSTICS.type, topics.DIAGNOSTICS.name, topics.DIAGNOSTICS.qos)
-    setpoints = ros.publisher(topics.SETPOINT.type, '/planner/setpoint', topics.SETPOINT.qos)
+    commands = ros.collect(topics.FLUX_DENSITY_COMMAND)
+    temperatures = ros.publisher(topics.TEMPERATURE, TOPIC)
+    ros.publisher(topics.FLUX_DENSITY_APPLIED)
+    diagnostics = ros.collect(topics.DIAGNOSTICS)
+    setpoints = ros.publisher(topics.SETPOINT, '/planner/setpoint')
 
     def known():
         temperatures.publish(Temperature(temperature=40.0))
@@ -58,9 +53,8 @@ def test_planner_plans_for_the_temperature_that_is_published(serve, ros):
 
 def test_plant_takes_the_temperature_that_is_published(serve, ros):
     serve(PlantNode, '-p', 'initial_stretch:=1.2', *COEFFICIENTS)
-    samples = ros.collect(
-        topics.JOINT_STATES.type, topics.JOINT_STATES.name, topics.JOINT_STATES.qos)
-    temperatures = ros.publisher(topics.TEMPERATURE.type, TOPIC, topics.TEMPERATURE.qos)
+    samples = ros.collect(topics.JOINT_STATES)
+    temperatures = ros.publisher(topics.TEMPERATURE, TOPIC)
 
     def stiffer():
         temperatures.publish(Temperature(temperature=298.15))  # which is refused
