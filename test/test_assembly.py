@@ -119,11 +119,9 @@ def test_a_coil_that_is_too_warm_is_switched_off_and_refused_until_it_has_cooled
     ({'coil.tesla_per_ampere': 1.0, 'sensor.latency': math.nan}, 'sensor.latency is nan'),
     ({'coil.tesla_per_ampere': 1.0, 'sensor.gain': 0.0}, 'sensor.gain is 0'),
     ({'coil.tesla': 1.0}, 'coil.tesla is no setting: expected coil.file, coil.limit'),
-    ({'port': 1}, 'port is no setting'),
-    ({'coil.file': '/none.csv'}, '/none.csv cannot be read'),
+    ({'port': 1}, 'port is no setting'), ({'coil.file': '/none.csv'}, '/none.csv cannot be read'),
     ({'coil.file': 'current,flux_density\n-1,-1\n0,0\n1,1\n2,1'}, 'rise from row to row'),
-    ({'coil.file': 'current,flux_density\n-1,-1\n0,0.1\n1,1'}, 'with 0 T at 0 A'),
-])
+    ({'coil.file': 'current,flux_density\n-1,-1\n0,0.1\n1,1'}, 'with 0 T at 0 A')])
 def test_what_is_no_coil_and_no_sensor_is_refused(tmp_path, settings, expected):
     if '\n' in settings.get('coil.file', ''):
         (tmp_path / 'coil.csv').write_text(settings['coil.file'])

@@ -230,13 +230,9 @@ def test_no_records_in_any_order_make_the_reader_fail(tmp_path, data):
 
 
 @pytest.mark.parametrize('options', [
-    {'use_chunking': False},
-    {'compression': CompressionType.LZ4},
-    {'compression': CompressionType.ZSTD},
-    {'repeat_channels': False, 'repeat_schemas': False},
-    {'use_statistics': False, 'use_summary_offsets': False},
-    {'enable_crcs': False},
-])
+    {'use_chunking': False}, {'compression': CompressionType.LZ4},
+    {'compression': CompressionType.ZSTD}, {'repeat_channels': False, 'repeat_schemas': False},
+    {'use_statistics': False, 'use_summary_offsets': False}, {'enable_crcs': False}])
 def test_what_other_writers_make_is_read(tmp_path, options):
     path = write_with_mcap(tmp_path / 'other.mcap', **options)
     reader, got = stamps(path)
@@ -295,8 +291,7 @@ def test_what_is_not_there_is_said(tmp_path, capsys):
     ('a.mcap.zstd', zstandard.compress(MAGIC), 'decompress it with "zstd -d FILE"'),
     ('a.bag', b'#ROSBAG V2.0\n', 'a.bag'),
     *((f'a{x}', b'version https://git-lfs.github.com/spec/v1\n', 'the file with "git lfs pull"')
-      for x in ('.mcap', '.db3', '.bag')),
-])
+      for x in ('.mcap', '.db3', '.bag'))])
 def test_a_file_that_is_no_bag_is_refused_with_a_way_on(
         tmp_path, capsys, name, content, advice, in_folder):
     (tmp_path / 'bag').mkdir()

@@ -189,10 +189,8 @@ def test_after_the_end_nothing_more_is_done(tmp_path):
 
 @pytest.mark.parametrize(('options', 'match'), [
     ({'flush_period': 0.0}, 'expected a finite number above 0 s'),
-    ({'max_size': 1023}, 'at least 1024'),
-    ({'max_duration_ns': -1}, 'expected at least 0'),
-    ({'cache_size': 0}, 'at least 1'),
-])
+    ({'max_size': 1023}, 'at least 1024'), ({'max_duration_ns': -1}, 'expected at least 0'),
+    ({'cache_size': 0}, 'at least 1')])
 def test_limits_out_of_range_are_refused(options, match):
     with pytest.raises(BadInputError, match=match):
         RecordingLimits(**options)

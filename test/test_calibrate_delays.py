@@ -136,8 +136,7 @@ def test_a_staircase_gives_a_law_and_the_scale_of_the_sensor():
 
 
 @pytest.mark.parametrize(('level', 'stretch', 'what'), [
-    (LEVELS, 1.0 - 3.0 * LEVELS, 'swap the leads'),
-    (LEVELS, math.nan * LEVELS, 'not all finite'),
+    (LEVELS, 1.0 - 3.0 * LEVELS, 'swap the leads'), (LEVELS, math.nan * LEVELS, 'not all finite'),
     (np.abs(LEVELS), 1.0 + LEVELS, 'of both signs'),
     (LEVELS, -1.0 + 3.0 * LEVELS, 'without a field'),
     (LEVELS[:3], 1.0 + LEVELS[:3], 'at least 6')])

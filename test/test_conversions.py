@@ -237,10 +237,8 @@ ARRIVED = Finding(Code.ARRIVED, 'rests', SETPOINT, 100, 1e-3, 1e-5, 2e-3, 1e-5, 
 
 
 @pytest.mark.parametrize(('code', 'severity', 'finding', 'measuring', 'failure'), [
-    ('arrived', 0, ARRIVED, True, ''),
-    ('replanned', 1, ARRIVED, True, ''),
-    ('accepted', 0, None, False, ''),
-    ('unobserved', 0, unobserved(SETPOINT), False, ''),
+    ('arrived', 0, ARRIVED, True, ''), ('replanned', 1, ARRIVED, True, ''),
+    ('accepted', 0, None, False, ''), ('unobserved', 0, unobserved(SETPOINT), False, ''),
     ('too_damped', 1, unobserved(SETPOINT), False, ''),
     ('unobserved', 1, unobserved(SETPOINT), True, 'setpoint 2 of 3: 1.4 is predicted'),
     ('replanned', 1, unobserved(SETPOINT), False, 'a sentence; the result is not measured'),

@@ -244,8 +244,7 @@ def test_a_move_that_collapses_where_the_force_falls_is_refused_and_others_are_f
     ('arruda_boyce', {'law.mu': [1e3]}, 'law.lambda_m is 0: expected more than 1'),
     ('nonaffine', {'law.gc': 1e3, 'law.lambda_m': 1.0}, 'law.lambda_m is 1: expected more than 1'),
     ('extended_tube', {'law.gc': 1e3}, 'law.beta is 0: expected more than 0'),
-    ('extended_tube', {'law.gc': 1e3, 'law.delta': 0.9, 'law.beta': 1.0}, 'got -620 Pa'),
-])
+    ('extended_tube', {'law.gc': 1e3, 'law.delta': 0.9, 'law.beta': 1.0}, 'got -620 Pa')])
 def test_constants_of_no_solid_are_refused_in_a_sentence(name, constants, message):
     with pytest.raises(BadInputError, match=message):
         block(name, constants)

@@ -112,8 +112,7 @@ def test_a_slow_amplifier_costs_its_ramp_and_half_a_period_at_most(start, target
 
 # A search by SciPy over level and hold had found a plan for each where ours had found none.
 @pytest.mark.parametrize(('state', 'target', 'slew'), [
-    (State(1.2595, 0.0085, 0.8159), 0.6331, 0.0694),
-    (State(1.2046, 0.0, 0.5271), 0.6201, 0.0694),
+    (State(1.2595, 0.0085, 0.8159), 0.6331, 0.0694), (State(1.2046, 0.0, 0.5271), 0.6201, 0.0694),
     (State(0.9770, -0.1044, 0.0888), 0.9757, 0.0694),
     (State(1.7542, 0.7372, 1.9849), 0.6713, 0.1734),
     (State(0.9918, -0.5374, -0.1842), 0.7103, 0.1734),

@@ -194,10 +194,8 @@ def test_console_blocks_are_commands_with_their_output():
     ('ros2 topic echo /stretsh', 'no topic'),
     ('ros2 service call /planner/stp std_srvs/srv/Trigger', 'no service'),
     ('ros2 param set /planner shapr zvd', "'shapr' is not declared"),
-    ('ros2 param set /plnner shaper zvd', 'no node'),
-    ('frobnicate', 'no program'),
-    ('echo "', 'unexpected EOF'),
-])
+    ('ros2 param set /plnner shaper zvd', 'no node'), ('frobnicate', 'no program'),
+    ('echo "', 'unexpected EOF')])
 def test_a_wrong_name_in_a_block_for_an_installation_is_found(text, reason):
     with pytest.raises(Failure, match=reason):
         check(a_block('bash', text, INSTALLATION))
@@ -209,9 +207,7 @@ def test_a_wrong_name_in_a_block_for_an_installation_is_found(text, reason):
     ('bash', REPOSITORY, '.ci/rn', 'no file'),
     ('bash', REPOSITORY, 'python -m benchmark faults', 'no module'),
     ('yaml', '', '/**:\n  ros__parameters:\n    lead_tme: 1.0\n', "'lead_tme' is not declared"),
-    ('yaml', '', 'a: [', 'expected'),
-    ('json', '', '{', 'Expecting'),
-])
+    ('yaml', '', 'a: [', 'expected'), ('json', '', '{', 'Expecting')])
 def test_a_wrong_name_in_any_other_block_is_found(language, marker, text, reason):
     with pytest.raises(Failure, match=reason):
         check(a_block(language, text, marker))

@@ -74,8 +74,7 @@ def test_after_the_vibration_branches_relax_alone_as_they_do_in_the_motion():
 
 
 @pytest.mark.parametrize(('material', 'shaper', 'delivery', 'wanted'), [
-    (TWO, 'minimum_time', IDEAL, 1e-6),
-    (ONE, 'robust', SAMPLED_PERIOD, 4e-4),
+    (TWO, 'minimum_time', IDEAL, 1e-6), (ONE, 'robust', SAMPLED_PERIOD, 4e-4),
     *(pytest.param(*x, marks=pytest.mark.slow) for x in (
         (ONE, 'two_step', IDEAL, 1e-6),
         (TWO, 'robust', Delivery(lag=0.1), 1e-6),

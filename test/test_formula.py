@@ -25,8 +25,7 @@ def law(energy):
     lambda strain, mu, n: mu * strain.over_stretches(lambda x: x ** n / n - log(x)),
     lambda strain, mu, n: -mu * log1p(-strain.first / (2.0 + n)) + 3.0 * mu * strain.second,
     lambda strain, mu, n: mu * ((1.0 + strain.first) ** n - 1.0) * 2.0 / (2.0 + strain.second),
-    lambda strain, mu, n: mu * (1.0 - (n + strain.second) ** -2 * n ** 2) + mu * strain.first,
-])
+    lambda strain, mu, n: mu * (1.0 - (n + strain.second) ** -2 * n ** 2) + mu * strain.first])
 def test_force_and_stiffness_are_derivatives_of_the_energy(energy):
     modulus, elastic = law(energy).scaled(VALUES)
     packed = pack(0.1, math.inf, 2.0, elastic)

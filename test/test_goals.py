@@ -112,8 +112,7 @@ def test_joints_come_in_any_order_but_all_of_them(joints):
     ({'path_tolerance': [('b', 0.1, 0.0)]}, r"path_tolerance has joint 'b': expected one of"),
     ({'goal_tolerance': [('a', -0.5, 0.0)]}, 'goal_tolerance of joint a is -0.5: expected more'),
     ({'goal_tolerance': [('a', 0.1, NAN)]}, 'goal_tolerance of joint a is nan: expected more'),
-    ({'goal_time_tolerance': -1}, 'goal_time_tolerance is -1e-09 s: expected at least 0 s'),
-])
+    ({'goal_time_tolerance': -1}, 'goal_time_tolerance is -1e-09 s: expected at least 0 s')])
 def test_a_tolerance_that_is_none_is_refused_and_the_goal_before_goes_on(wish, text):
     bench = Bench()
     bench.add([(1.2, 100)])

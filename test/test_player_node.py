@@ -433,8 +433,7 @@ def test_a_database_is_played(ros, play, tmp_path):
     ([('/a', 0, 1), ('/b', 900, 1)], ('play.topics_to_filter:=[/b]',
                                       'play.playback_duration.nsec:=500000',
                                       'play.playback_duration.sec:=0'),
-     '/b has none in the part that is played'),
-])
+     '/b has none in the part that is played')])
 def test_a_player_that_sends_nothing_says_why_and_fails(play, tmp_path, entries, parameters, why):
     process = play(write_bag(tmp_path / 'bag', entries), *parameters)
     assert process.wait() == 1, process.output
@@ -460,8 +459,7 @@ def test_a_relative_topic_is_sent_in_the_namespace_of_the_player(
     (('storage.uri:={bag}', 'play.start_offset.sec:=5'),
      'play.start_offset is 5 s: expected at most 0 s'),
     (('storage.uri:={bag}', 'play.regex_to_filter:="("'), 'expected a regular expression'),
-    (('storage.uri:={bag}', 'play.wait_for_subscribers:=[/b]'), 'expected topics that are sent'),
-])
+    (('storage.uri:={bag}', 'play.wait_for_subscribers:=[/b]'), 'expected topics that are sent')])
 def test_bad_input_is_refused_in_one_line(
         ros_env, handlers, tmp_path, capfd, parameters, expected):
     bag = write_bag(tmp_path / 'bag', [('/a', 0, 0)])
