@@ -226,7 +226,6 @@ def test_axes_that_do_not_exist_are_refused_in_one_line(refusal, words, message)
     assert message in refusal(f'sweep {words}')
 
 
-
 def test_what_a_file_says_of_planning_and_options_decide_is_said(run, params_file):
     path = params_file(shaper='robust', robust_order=3, smooth_periods=1, command_mode='sampled')
     for words, unused in (
