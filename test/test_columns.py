@@ -142,3 +142,8 @@ def test_another_unit_is_refused_with_what_to_do(csv, text, message):
     wanted = WANTED if 'flux' in text else ('time', 'stretch')
     with pytest.raises(BadInputError, match=message):
         read_table(csv(text), wanted)
+
+
+def test_a_path_that_stands_still_in_time_is_refused_with_its_line(csv):
+    with pytest.raises(BadInputError, match='line 4 has the time 0.1 s after 0.1 s: expected'):
+        read_path(csv('time,stretch\n0,1\n0.1,1.1\n0.1,1.0\n'))

@@ -42,7 +42,13 @@ def read_path(file: File) -> tuple[Array, Array]:
     """
     table = read_table(file, ('time', 'stretch'))
     table.check_complete(file)
-    return table.columns['time'], table.columns['stretch']
+    times = table.columns['time']
+    back = np.flatnonzero(np.diff(times) <= 0.0)
+    if len(back):
+        raise BadInputError(
+            f'{file} line {table.lines[back[0] + 1]} has the time {times[back[0] + 1]:.9g} s '
+            f'after {times[back[0]]:.9g} s: expected increasing times')
+    return times, table.columns['stretch']
 
 
 def path_of(actuator: 'Actuator', columns: tuple[Any, ...]) -> Path:
