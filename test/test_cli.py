@@ -248,6 +248,16 @@ def test_send_without_a_planner_says_how_to_start_one(start):
     assert 'no planner in namespace /; start one with hmsa planner' in send.stderr
 
 
+@pytest.mark.ros
+def test_a_client_names_the_namespace_of_a_planner_that_it_does_not_find(start):
+    start.hmsa('planner', '--ros-args', '-r', '__ns:=/arm')
+    for command in (('send', '1.1:1', '--timeout', '4'), ('stop', '--timeout', '4')):
+        client = start.hmsa(*command)
+        assert client.wait(30.0) == 1
+        assert 'no planner in namespace /, but in /arm: name it with --namespace /arm' in (
+            client.stderr)
+
+
 # Help ----------------------------------------------------------------------------------------
 
 def test_a_long_operation_says_what_is_under_way_and_how_long_where_no_bar_is_shown(

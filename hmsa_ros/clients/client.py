@@ -82,7 +82,10 @@ class PlannerClient(Link):
 
     def find_planner(self, each: Callable[[], None] | None = None) -> None:
         """Wait until a planner subscribes and its status has arrived; call ``each`` meanwhile."""
-        where, failure = self._namespace or '/', self.no_planner
+        where = self._namespace or '/'
+
+        def failure() -> str:
+            return self.no_planner
 
         def found() -> bool:
             return self.verdict is not SILENCE and self._reached()

@@ -15,7 +15,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from hmsa.cli.terminal import under_way
 from hmsa.ending import ENDING
-from hmsa.errors import HmsaError
+from hmsa.errors import HmsaError, listed
 from hmsa.interfaces import topics
 from hmsa.interfaces.diagnostics import StatusVerdict
 from hmsa.model.status import Code
@@ -71,9 +71,18 @@ class Link(TemporaryNode):
     @property
     def no_planner(self) -> str:
         """That no planner is found, and what to do."""
+        here = f'no planner in namespace {self._namespace or "/"}'
+        if others := self.namespaces:
+            return f'{here}, but in {listed(others)}: name it with --namespace {others[0]}'
         return (
-            f'no planner in namespace {self._namespace or "/"}; start one with hmsa planner, with '
-            'the same ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE as here')
+            f'{here}; start one with hmsa planner, with the same ROS_DOMAIN_ID and '
+            'ROS_AUTOMATIC_DISCOVERY_RANGE as here')
+
+    @property
+    def namespaces(self) -> list[str]:
+        """Other namespaces with a planner."""
+        return sorted(x for name, x in self.node.get_node_names_and_namespaces()
+                      if name == topics.PLANNER and x != self.node.get_namespace())
 
     def publish_stop(self, name: str) -> None:
         """Send a stop of a name."""
@@ -157,7 +166,11 @@ class Stopping:
         if self.failure is not None:
             return self.failure
         if self._sent == -math.inf:
-            return f'waiting up to {self._link.timeout:g} s for {self._link.planner}, to stop it'
+            others = self._link.namespaces
+            where = f' (one runs in {listed(others)}: --namespace {others[0]})' if others else ''
+            return (
+                f'waiting up to {self._link.timeout:g} s for {self._link.planner}, to stop it'
+                f'{where}')
         return f'waiting for {self._link.planner} to answer the stop' if (
             self._verdict is None) else 'stopping: waiting for plant or driver to acknowledge it'
 
