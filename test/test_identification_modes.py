@@ -3,6 +3,7 @@
 from dataclasses import replace
 from datetime import datetime
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -207,6 +208,18 @@ def test_a_large_mode_that_changes_with_the_stretch_is_named_and_asks_for_smalle
     found = identify(recording, WITH_MODES, actuator=known)
     assert found.verdict == 'model_rejected'
     assert 'record steps half as large' in found.reason
+
+
+def test_modes_that_explain_nearly_all_residuals_are_named_whatever_their_intervals(monkeypatch):
+    # As on finite elements of a tall block, of which no step was recorded twice.
+    monkeypatch.setattr(sys.modules['hmsa.identification.identify'], '_CLEAR', 1e9)
+    tall = replace(BLOCK, half_thickness=3.0 * BLOCK.half_length, damping_coefficient=0.15)
+    found = identify(
+        recorded(replace(tall, mass_factor=1.2, modes=Modes(
+            (2.4, 2.7, 3.0), (0.05, 0.08, 0.02), (0.2, 0.22, 0.24), (), (-2.0, 1.0, 2.0))),
+            count=3), actuator=tall)
+    assert found.verdict == 'model_rejected'
+    assert found.signatures[0].remedy == MODES
 
 
 def test_close_modes_that_change_with_the_stretch_are_no_single_one_of_more_damping():

@@ -52,8 +52,9 @@ _CERTAIN = 1e-4
 _ADVISED = (GAIN, 'sensor_latency', 'coil_time_constant', 'constant_force', *(
     x for names in quantities.BRANCHES for x in names))
 _WORSE, _SURE = 10.0, 3.0
-# Size of a mode in standard deviations that rejects a fit alone.
-_CLEAR = 8.0
+# Size of a mode in standard deviations that rejects a fit alone, and so does the fraction of the
+# residuals' sum of squares that modes explain: correlated noise leaves more.
+_CLEAR, _NEARLY_ALL = 8.0, 0.9
 # Residuals along the elastica in units of those with the shape of the first mode, below which a
 # beam that this does not describe to the noise is fitted so; and what is said then.
 _CLOSER = 0.97
@@ -394,7 +395,7 @@ def _modes_left(
     wider = widening(found.root[:, None] * found.jacobian, weighted, inverse, whiteness(weighted))
     modes = modes_in(found, inverse * found.scale ** 2 * np.outer(wider, wider))
     sizes = [2.0 * HALF_95 * abs(x.share[0]) / max(x.share[2] - x.share[1], 1e-9) for x in modes]
-    if not rejected and max(sizes) < _CLEAR:
+    if not rejected and max(sizes) < _CLEAR and part < _NEARLY_ALL:
         return (), []
     return modes, [Defect(x.words, part, size, True, quantities.MODES)
                    for x, size in zip(modes, sizes, strict=True)]
