@@ -11,10 +11,10 @@ from scipy.integrate import solve_ivp
 
 from benchmarks.block_elements import Block
 from hmsa.cli import main
-from hmsa.identification.diagnosis import cost, unexplained
+from hmsa.identification.diagnosis import cost, misfit, unexplained
 from hmsa.identification.excitation import Bounds, excite
 from hmsa.identification.files import file_text, read_belief
-from hmsa.identification.fit import fit
+from hmsa.identification.fit import fit, whiteness
 from hmsa.identification.identify import identify
 from hmsa.identification.measurement import Measurement
 from hmsa.identification.quantities import (
@@ -201,13 +201,17 @@ def test_a_large_mode_that_changes_with_the_stretch_is_named_and_asks_for_smalle
     known = replace(BLOCK, damping_coefficient=0.24)
     recording = recorded(replace(
         known, mass_factor=1.24, transverse_mass_factor=2.5, modes=Modes(
-            (1.36,), (0.4,), (0.05,), exponents=(0.7,), share_exponents=(-8.0,))), count=5)
+            (1.36,), (0.4,), (0.05,), exponents=(0.7,), share_exponents=(-10.0,))), count=5)
     plain = identify(recording, actuator=known)
     assert plain.signatures[0].remedy == MODES
     assert plain.reason.endswith('try --free +modes')
     found = identify(recording, WITH_MODES, actuator=known)
     assert found.verdict == 'model_rejected'
     assert 'record steps half as large' in found.reason
+    # So do the same modes in a parameter file.
+    told = fit(recording, found.values, ('remanence',), most=2)
+    assert 'record steps half as large' in misfit(
+        told, whiteness(told.root * told.residual), (), None)
 
 
 def test_modes_that_explain_nearly_all_residuals_are_named_whatever_their_intervals(monkeypatch):

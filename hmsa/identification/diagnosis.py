@@ -16,7 +16,7 @@ import numpy as np
 from hmsa.errors import BadInputError
 from hmsa.identification import quantities
 from hmsa.identification.defects import GAIN, USUAL_GAIN
-from hmsa.identification.fit import autocorrelation, Fit, Whiteness
+from hmsa.identification.fit import autocorrelation, Fit, Whiteness, whiteness
 from hmsa.identification.initial_guess import segments
 from hmsa.identification.result import Defect
 from hmsa.model import equations
@@ -45,7 +45,8 @@ _FEW_WORDS = 4  # maximum number of frequencies to list
 _FIRST_KEPT = ('density', 'chain_limit', 'stretch_gain')  # easiest to know from other sources
 _WORTH_SAYING = 0.3  # minimum change of a parameter to report, in standard deviations
 _NUMERICAL = 1e-6  # residuals below this are integration errors
-# Advice for a departure of unknown kind.
+# Advice where modes change with the stretch, and for a departure of unknown kind.
+_SMALLER = 'record steps half as large'
 _LOOK = '; see the figures of --report page.html'
 # Parameters that determine the frequency.
 _TIMED = {'shear_modulus', 'density', 'time_unit'}
@@ -169,6 +170,8 @@ def allowed(fit: Fit) -> Array:
         'coil_time_constant': max(_RELATIVE * values['coil_time_constant'], 0.1 * unit),
         # Between stretches of 0.9 and 1.1 it changes the damping by a fifth.
         'damping_exponent': 1.0,
+        # That of a cube changes its frequency by 2 %.
+        'transverse_mass_factor': 0.5,
         'constant_force': 0.1 * load, 'initial_stretch': 0.05, 'initial_rate': 0.5 / unit,
         # The share of a mode shows more of it than its damping does.
         **{x[2]: 0.5 for x in quantities.SECONDARY},
@@ -227,12 +230,14 @@ def weakness(fit: Fit, deviation: float, factors: Array) -> tuple[set[str], str]
         advice = [quantities.QUANTITIES['density'].advice]
     kept = next((x for x in _FIRST_KEPT if x in names), names[0])
     listed = '; '.join(sentences) or 'the recorded motion hardly depends on them'
+    keep = (
+        f'keep what is known, as with --free=-{kept} or --known {kept}=VALUE+-STD'
+        if kept in quantities.DEFAULT_FREE else
+        f'leave {kept} out, as with {freeing(fit, [kept])}')
+    instead = _SMALLER if modal(fit) and not whiteness(fit.root * fit.residual).white else (
+        f'{"; or ".join(advice[:3])}; or {keep}')
     return set(names), (
-        f'{_listed(names)} cannot be identified from this recording: {listed}. Instead, '
-        f'{"; or ".join(advice[:3])}; or ' + (
-            f'keep what is known, as with --free=-{kept} or --known {kept}=VALUE+-STD'
-            if kept in quantities.DEFAULT_FREE else f'leave {kept} out, as with '
-            f'{freeing(fit, [kept])}'))
+        f'{_listed(names)} cannot be identified from this recording: {listed}. Instead, {instead}')
 
 
 def _change(fit: Fit, place: int, change: float, first: float) -> str:
@@ -382,12 +387,12 @@ def misfit(
         f'{float(autocorrelation(fit.residual * fit.root)[1]):.2f} from one sample '
         f'to the next (white with a probability of {found.p_value:.2g})')
     if distant(fit, found) and not any(x.remedy == quantities.MODES for x in seen):
-        if tolerant and quantities.modes_of(fit.values) and not _remedy(seen):
-            name = fit.recording.coordinate.name
+        if quantities.modes_of(fit.values) and not _remedy(seen):
+            name, most = fit.recording.coordinate.name, TOLERATED if tolerant else DISTANT
             return (
                 f'secondary modes leave {unexplained(fit):.1%} of the recorded motion, more than '
-                f'{TOLERATED:.0%}: those of a continuum change with the {name}; record steps half '
-                'as large, and if they leave as much, check units, clock and --params-file')
+                f'{most:.0%}: those of a continuum change with the {name}; {_SMALLER}, and if '
+                'they leave as much, check units, clock and --params-file')
         return (
             f'the model cannot reproduce the recorded motion: {figures}, against a motion of '
             f'{motion:.3g} rms; check that times are in s and levels in tesla, of one clock and '
