@@ -11,6 +11,7 @@ from scipy.integrate import solve_ivp
 
 from benchmarks.block_elements import Block
 from hmsa.cli import main
+from hmsa.identification import modal
 from hmsa.identification.diagnosis import cost, misfit, unexplained
 from hmsa.identification.excitation import Bounds, excite
 from hmsa.identification.files import file_text, read_belief
@@ -234,6 +235,18 @@ def test_close_modes_that_change_with_the_stretch_are_no_single_one_of_more_damp
     assert found.verdict == 'identified', found.reason
     assert [x.ratio[0] for x in found.modes] == pytest.approx([1.7, 2.1], rel=0.05)
     assert [x.share[0] for x in found.modes] == pytest.approx([0.12, 0.12], rel=0.15)
+
+
+def test_what_was_not_asked_for_is_not_free_where_the_modes_hide_it(monkeypatch):
+    # As on finite elements of a flat block, where each coordinate improves the fit.
+    monkeypatch.setattr(modal, '_completed', lambda best, _: best)
+    flat = replace(BLOCK, half_thickness=0.02 * BLOCK.half_length, damping_coefficient=5.0)
+    found = identify(recorded(replace(flat, mass_factor=1.4, modes=Modes(
+        (1.3,), (0.2,), (0.05,))), count=2), WITH_MODES, actuator=flat)
+    assert found.verdict == 'identified', found.reason
+    assert 'transverse_mass_factor' not in found.names
+    assert found.values['transverse_mass_factor'] == 1.0
+    assert found.parameters['mass_factor'].value == pytest.approx(1.4, rel=0.01)
 
 
 def test_a_mode_close_to_the_first_is_named_and_identified():

@@ -25,6 +25,7 @@ from hmsa.identification.initial_guess import begins_at_rest
 from hmsa.identification.intervals import estimates_of, Precision, precision_of, stamp_error
 from hmsa.identification.measurement import Measurement
 from hmsa.identification.modal import (
+    BESIDES,
     contested,
     ENOUGH,
     explained,
@@ -144,11 +145,9 @@ def identify(
     if quantities.MODES in free:
         kept = actuator.chain_limit
         if 'chain_limit' in free and not stiffens(recording, kept):
-            recording, free, values = _keeping(recording, free, values, kept)
+            recording, values = _keeping(recording, kept), {**values, 'chain_limit': kept}
+            free = tuple(x for x in free if x != 'chain_limit')
         found = _with_modes(recording, free, values, actuator, known, given)
-        if math.isnan(found.parameters['chain_limit'].value):
-            found = _with_modes(
-                *_keeping(recording, free, values, kept), actuator, known, given)
     else:
         best, tried, agreed = search(recording, values, free)
         best, others = rivals(best)
@@ -165,14 +164,11 @@ def identify(
     return found
 
 
-def _keeping(
-        recording: Measurement, free: Sequence[str], values: Mapping[str, Any], limit: float
-) -> tuple[Measurement, tuple[str, ...], dict[str, Any]]:
-    """Return a recording with a note, and names and values, to keep J_lim as given."""
-    note = f'chain_limit is kept at {limit:g}: the recording shows its modes, and hardly this'
-    return (
-        replace(recording, notes=(*recording.notes, note)),
-        tuple(x for x in free if x != 'chain_limit'), {**values, 'chain_limit': limit})
+def _keeping(recording: Measurement, limit: float) -> Measurement:
+    """Return a recording with a note that J_lim is kept as given."""
+    return replace(recording, notes=(
+        *recording.notes,
+        f'chain_limit is kept at {limit:g}: the recording shows its modes, and hardly this'))
 
 
 def _with_modes(
@@ -180,13 +176,29 @@ def _with_modes(
         actuator: ActuatorParameters, known: Collection[str],
         given: Mapping[str, float | None]) -> Identification:
     """Return the result with as many secondary modes as a recording shows."""
+    limit = actuator.chain_limit
     begin, first, together = without_modes(values, free, known)
     one, tried, agreed = search(recording, begin, first)
     start = one.values if 'shear_modulus' in together or together == first else rescaled(
         one.values, values['shear_modulus'], together)
-    best = narrower(one, start, together, actuator.chain_limit, actuator.modes.numbers)
-    return _conclude(
-        *_with_errors_of_stamps(best), [], tried, agreed, given, actuator.chain_limit, one)
+
+    def concluded(best: Fit) -> Identification:
+        return _conclude(*_with_errors_of_stamps(best), [], tried, agreed, given, limit, one)
+
+    best = narrower(one, start, together, limit, actuator.modes.numbers)
+    found = concluded(best)
+    # J_lim, and what nobody asked for, keep their values where errors of the modes hide them.
+    usual = {'chain_limit': limit} | {x: y for x, (y, _) in BESIDES.items() if x not in free}
+    while found.verdict == 'not_identifiable' and (hidden := {
+            x: y for x, y in usual.items()
+            if x in best.free and math.isnan(found.parameters[x].value)}):
+        less = fit(
+            _keeping(best.recording, limit) if 'chain_limit' in hidden else best.recording,
+            {**best.values, **hidden}, tuple(x for x in best.free if x not in hidden))
+        if less is None:
+            break
+        best, found = less, concluded(less)
+    return found
 
 
 def _challenged(

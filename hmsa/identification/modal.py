@@ -51,9 +51,9 @@ _MOST_SAMPLES = 2000
 # Frequency ratios from which each mode is sought, besides those of the lines in the residuals.
 _STARTS = (1.1, 1.2, 1.4, 1.7, 2.1, 2.7, 3.4, 4.5, 6.0)
 _SHARE, _LEAST_DAMPING, _MOST_DAMPING = 0.1, 0.03, 0.3
-# What a block has besides, with the values of one that deforms uniformly, and at which to begin;
-# maximum J_lim there.
-_BESIDES = {'transverse_mass_factor': (1.0, 1.5), 'damping_exponent': (0.0, 0.0)}
+#: What a block has besides, with the values of one that deforms uniformly, and at which to begin.
+BESIDES = {'transverse_mass_factor': (1.0, 1.5), 'damping_exponent': (0.0, 0.0)}
+# Maximum J_lim at which a fit begins.
 _LOOSE = 1e6
 # Simulations from each start, and for the best; for the first mode with its factor.
 _FEW, _FULL, _FIRST = 8, 30, 8
@@ -350,8 +350,8 @@ def with_modes(
     highest, lowest = highest_ratio(recording, own), _lowest(best.values)
     wide, values = tuple(free), dict(best.values)
     if values['law'] is None or not values['law'].section:
-        wide = tuple(dict.fromkeys((*(x for x in free if x != 'chain_limit'), *_BESIDES)))
-        values |= {x: begin for x, (usual, begin) in _BESIDES.items() if values[x] == usual}
+        wide = tuple(dict.fromkeys((*(x for x in free if x != 'chain_limit'), *BESIDES)))
+        values |= {x: begin for x, (usual, begin) in BESIDES.items() if values[x] == usual}
         if 'chain_limit' in free:
             values['chain_limit'] = min(limit, _LOOSE)
     damping = _damping_ratio(values)
@@ -421,14 +421,14 @@ def _viscous(found: Fit) -> Fit:
 
 
 def _completed(best: Fit, free: Sequence[str]) -> Fit:
-    """Return a fit in which J_lim is free, too, and of `_BESIDES` what matters."""
+    """Return a fit in which J_lim is free, too, and of `BESIDES` what matters."""
     recording = best.recording
     if 'chain_limit' in free and 'chain_limit' not in best.free:
         found = fit(recording, best.values, (*best.free, 'chain_limit'), most=_FULL)
         if found is not None and _possible(found):
             best = found
-    for name in [x for x in _BESIDES if x in best.free and x not in free]:
-        values = {**best.values, name: _BESIDES[name][0]}
+    for name in [x for x in BESIDES if x in best.free and x not in free]:
+        values = {**best.values, name: BESIDES[name][0]}
         less = fit(recording, values, tuple(x for x in best.free if x != name), most=_FULL)
         if less is not None and _possible(less) and _gain(less, best)[0] < _CHI_SQUARED:
             best = less
