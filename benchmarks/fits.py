@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from time import perf_counter
+from time import process_time
 
 import numpy as np
 from scipy.constants import mu_0
@@ -40,11 +40,11 @@ def with_scipy(
             len(recording.time), 1e3)
 
     first = np.array([to_coordinate(x, start[x]) for x in free])
-    begin = perf_counter()
+    begin = process_time()
     found = least_squares(
         residual, first, method='trf', x_scale='jac',
         jac=(lambda x: respond_at(x, free).jacobian) if derivatives else '2-point')
-    seconds = perf_counter() - begin
+    seconds = process_time() - begin
     return Fitted({n: from_coordinate(n, x) for n, x in zip(
         free, found.x.tolist(), strict=True)}, seconds)
 
@@ -138,12 +138,12 @@ def with_casadi(
         return np.concatenate([head, table.ravel(order='F')])
 
     def run() -> Fitted:
-        begin = perf_counter()
+        begin = process_time()
         found = solver(
             x0=pack(first, guess), lbg=0.0, ubg=0.0,
             lbx=pack(np.full(len(names), -np.inf), low), ubx=pack(
                 np.full(len(names), np.inf), high))
-        seconds = perf_counter() - begin
+        seconds = process_time() - begin
         if not solver.stats()['success']:
             raise ArithmeticError(f'IPOPT ended with {solver.stats()["return_status"]}')
         solved = np.array(found['x']).ravel()[:len(names)] * scales
