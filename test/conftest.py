@@ -580,6 +580,14 @@ class RosSide:
             f'the end of the client of {name}')
         return response
 
+    def change(self, node: str, *transitions: str) -> bool:
+        """Have a node make transitions, and return whether it has made all of them."""
+        from lifecycle_msgs.msg import Transition
+        from lifecycle_msgs.srv import ChangeState
+        return all(self.call(
+            ChangeState, f'{node}/change_state', ChangeState.Request(
+                transition=Transition(label=x))).success for x in transitions)
+
     def set_parameters(self, node: str, values: Sequence[Any]) -> Any:
         """Set parameters of another node."""
         from rcl_interfaces.srv import SetParameters

@@ -1,7 +1,5 @@
 """Planner and plant in one process: the same interface, and no middleware between them."""
 
-from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 import numpy as np
@@ -129,16 +127,11 @@ def test_a_plant_that_is_taken_away_is_missed_and_comes_back(start, ros):
     start.hmsa('controller', '--ros-args', '-p', 'lead_time:=0.5')
     setpoint = ros.publisher(topics.SETPOINT, 'planner/setpoint')
 
-    def plant(*transitions):
-        for x in transitions:
-            request = ChangeState.Request(transition=Transition(id=x))
-            assert ros.call(ChangeState, 'plant/change_state', request).success
-
-    plant(Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP)
+    assert ros.change('plant', 'deactivate', 'cleanup')
     setpoint.publish(Float64(data=1.1))
     ros.spin_until(
         lambda: statuses and 'not active' in statuses[-1].message, 'that nobody carries it out')
-    plant(Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE)
+    assert ros.change('plant', 'configure', 'activate')
     ros.spin_until(lambda: 'not active' not in statuses[-1].message, 'the plant')
     setpoint.publish(Float64(data=1.2))
     ros.spin_until(

@@ -2,8 +2,6 @@
 
 import importlib.util
 
-from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState
 import pytest
 from rclpy.action import ActionClient
 from rclpy.duration import Duration
@@ -185,14 +183,10 @@ def test_whoever_takes_the_actuator_ends_the_goal(nodes, ros, client):
     assert client.ended(handle) == (ABORTED, ErrorCode.INVALID_GOAL)
     handle = client.send(*LONG)
 
-    def change(transition):
-        return ros.call(ChangeState, '/planner/change_state', ChangeState.Request(
-            transition=Transition(id=transition))).success
-
-    assert change(Transition.TRANSITION_DEACTIVATE)
+    assert ros.change('planner', 'deactivate')
     assert client.ended(handle) == (ABORTED, ErrorCode.INVALID_GOAL)
     assert not client.send((1.2, None, 0.5)).accepted
-    assert change(Transition.TRANSITION_ACTIVATE)
+    assert ros.change('planner', 'activate')
     assert client.ended(client.send((1.2, None, 0.5))) == ARRIVED
 
 

@@ -4,7 +4,6 @@ from dataclasses import replace
 from functools import partial
 import math
 
-from lifecycle_msgs.srv import ChangeState
 import pytest
 from std_msgs.msg import Bool
 from test_runtime_hosts import BEATING, Bench, MS, START
@@ -309,10 +308,7 @@ def test_an_interlock_stays_open_while_a_driver_is_configured_anew(start, ros, t
     ros.spin_until(lambda: door.get_subscription_count() and shown() == ['closed'], 'a driver')
     door.publish(Bool(data=False))
     ros.spin_until(lambda: shown() == ['open: a publisher has opened it'], 'an open interlock')
-    for change in ('deactivate', 'cleanup', 'configure', 'activate'):
-        request = ChangeState.Request()
-        request.transition.label = change
-        assert ros.call(ChangeState, 'driver/change_state', request).success
+    assert ros.change('driver', 'deactivate', 'cleanup', 'configure', 'activate')
     health.clear()
     ros.spin_until(shown, 'a driver that is there again')
     assert shown() == ['open: a publisher has opened it']

@@ -6,8 +6,6 @@ import signal
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState
 import pytest
 from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
@@ -426,16 +424,11 @@ def test_trajectory_that_is_too_long_or_garbage_is_refused(rig):
 
 
 def test_deactivated_it_comes_to_rest_and_activated_again_it_takes_over(rig, ros):
-    def change(transition: int) -> None:
-        answer = ros.call(ChangeState, 'planner/change_state', ChangeState.Request(
-            transition=Transition(id=transition)))
-        assert answer.success
-
     planner = rig('-p', 'heartbeat_period:=0.01')
     driver = planner.driver
     planner.send(to_trajectory(SEQUENCE, 'actuator'))
     planner.at(START + 3 * MS)
-    change(Transition.TRANSITION_DEACTIVATE)
+    assert ros.change('planner', 'deactivate')
     planner.verdict(code='inactive')
     assert planner.send(to_trajectory(SEQUENCE, 'actuator'), 'inactive').level == ERROR
     sent = planner.runtime.devices.sent + planner.runtime.devices.heartbeats
@@ -447,7 +440,7 @@ def test_deactivated_it_comes_to_rest_and_activated_again_it_takes_over(rig, ros
     planner.at(START + 500 * MS)
     samples = ros.publisher(JointState, 'joint_states', 10, subscribers=0)
     ros.spin_until(lambda: planner.planner.count_publishers('joint_states'), 'the publisher')
-    change(Transition.TRANSITION_ACTIVATE)
+    assert ros.change('planner', 'activate')
     assert planner.runtime.devices.sent + planner.runtime.devices.heartbeats == sent
     planner.trajectories.publish(to_trajectory([(1.3, SPELL)], 'actuator', frame='again'))
 
@@ -461,12 +454,10 @@ def test_deactivated_it_comes_to_rest_and_activated_again_it_takes_over(rig, ros
         ros.executor.spin_once(0.005)
         driver.advance(planner.now)
     assert driver.residual(1.3) < 0.3 * RESIDUAL
-    change(Transition.TRANSITION_DEACTIVATE)
-    change(Transition.TRANSITION_CLEANUP)
+    assert ros.change('planner', 'deactivate', 'cleanup')
     ros.spin_until(
         lambda: not ros.node.count_publishers('flux_density_command'), 'the end of the topics')
-    change(Transition.TRANSITION_CONFIGURE)
-    change(Transition.TRANSITION_ACTIVATE)
+    assert ros.change('planner', 'configure', 'activate')
     ros.spin_until(
         lambda: ros.node.count_publishers('flux_density_command'), 'the topics again')
 

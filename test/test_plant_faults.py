@@ -6,8 +6,6 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import WrenchStamped
-from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState
 import pytest
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
@@ -261,34 +259,28 @@ def test_the_achieved_real_time_factor_is_told_and_can_be_changed(stand):
 def test_an_inactive_plant_holds_time_and_takes_no_commands(ros, serve):
     serve(PlantNode, '-p', 'publish_clock:=true', '-p', 'autostart:=false')
 
-    def change(transition: int) -> bool:
-        request = ChangeState.Request(transition=Transition(id=transition))
-        return bool(ros.call(ChangeState, 'plant/change_state', request).success)
-
-    assert change(Transition.TRANSITION_CONFIGURE)
+    assert ros.change('plant', 'configure')
     plant = Stand(ros)
     plant.send((0, 0.05))
     assert not plant.call(topics.STEP).success
     plant.report('time', state='inactive')
     assert plant.samples == []
-    assert change(Transition.TRANSITION_ACTIVATE)
+    assert ros.change('plant', 'activate')
     ros.spin_until(lambda: len(plant.samples) > 10, 'samples')
     assert {x.effort[0] for x in plant.samples} == {0.0}
-    assert change(Transition.TRANSITION_DEACTIVATE)
+    assert ros.change('plant', 'deactivate')
     plant.report('time', state='inactive')
     plant.report('time', state='inactive')
     count = len(plant.samples)
     plant.report('time', state='inactive')
     assert len(plant.samples) == count
-    assert change(Transition.TRANSITION_ACTIVATE)
+    assert ros.change('plant', 'activate')
     ros.spin_until(lambda: len(plant.samples) > count, 'more samples')
     stamps = [from_time(x.header.stamp) for x in plant.samples]
     assert stamps == list(range(stamps[0], stamps[-1] + 1, MS))
-    assert change(Transition.TRANSITION_DEACTIVATE)
-    assert change(Transition.TRANSITION_CLEANUP)
+    assert ros.change('plant', 'deactivate', 'cleanup')
     ros.spin_until(lambda: not ros.node.count_publishers('joint_states'), 'the topic to go')
-    assert change(Transition.TRANSITION_CONFIGURE)
-    assert change(Transition.TRANSITION_ACTIVATE)
+    assert ros.change('plant', 'configure', 'activate')
     known = len(plant.samples)
     ros.spin_until(lambda: len(plant.samples) > known, 'samples of the new start')
     assert ros.call(SetBool, 'plant/set_paused', SetBool.Request(data=True)).success

@@ -5,8 +5,6 @@ import signal
 import time
 
 from extras import needs
-from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState
 from mcap.writer import Writer
 import pytest
 from rclpy.parameter import Parameter
@@ -245,33 +243,26 @@ def test_it_plays_while_it_is_active(ros, play, tmp_path):
     got = ros.collect(Float64, '/a')
     process = play(bag, 'autostart:=false')
 
-    def change(transition):
-        request = ChangeState.Request()
-        request.transition.id = transition
-        return ros.call(ChangeState, 'player/change_state', request).success
-
-    assert change(Transition.TRANSITION_CONFIGURE)
+    assert ros.change('player', 'configure')
     ros.spin_until(lambda: ros.node.count_publishers('/a'), 'the publisher')
     for name in ('resume', 'play_next'):
         answer = ros.call(Trigger, f'player/{name}')
         assert not answer.success
         assert answer.message == 'the player is inactive: expected an active one'
     assert not got
-    assert change(Transition.TRANSITION_ACTIVATE)
+    assert ros.change('player', 'activate')
     ros.spin_until(lambda: len(got) > 10, 'messages')
-    assert change(Transition.TRANSITION_DEACTIVATE)
+    assert ros.change('player', 'deactivate')
     assert ros.call(Trigger, 'player/is_paused').success
     count = len(got)
-    assert change(Transition.TRANSITION_ACTIVATE)
+    assert ros.change('player', 'activate')
     ros.spin_until(lambda: len(got) > count + 10, 'more messages')
-    assert change(Transition.TRANSITION_DEACTIVATE)
-    assert change(Transition.TRANSITION_CLEANUP)
+    assert ros.change('player', 'deactivate', 'cleanup')
     ros.spin_until(lambda: not ros.node.count_publishers('/a'), 'the end of the publisher')
     assert [message.data for message in got] == list(range(len(got)))
     # From the start again.
     del got[:]
-    assert change(Transition.TRANSITION_CONFIGURE)
-    assert change(Transition.TRANSITION_ACTIVATE)
+    assert ros.change('player', 'configure', 'activate')
     ros.spin_until(lambda: len(got) > 3, 'messages from the start')
     assert got[0].data == 0.0
     assert process.stop() == 0, process.output

@@ -7,8 +7,6 @@ import time
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from extras import needs
-from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState
 import pytest
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -578,30 +576,24 @@ def test_the_experiment_goes_into_the_bag(record, ros, make_ros):
 def test_it_records_while_it_is_active(record, ros):
     recorder = record('autostart:=false')
 
-    def change(transition):
-        request = ChangeState.Request()
-        request.transition.id = transition
-        return ros.call(ChangeState, 'recorder/change_state', request).success
-
-    assert change(Transition.TRANSITION_CONFIGURE)
+    assert ros.change('recorder', 'configure')
     publisher = ros.publisher(Float64, '/a')
     recorder.wait_for('state', 'inactive')
     send(publisher, 1.0)
     assert not recorder.call('resume').success
-    assert change(Transition.TRANSITION_ACTIVATE)
+    assert ros.change('recorder', 'activate')
     recorder.hear(publisher, 2.0, received=1)
-    assert change(Transition.TRANSITION_DEACTIVATE)
+    assert ros.change('recorder', 'deactivate')
     send(publisher, 3.0)
     recorder.wait_for('state', 'inactive')
-    assert change(Transition.TRANSITION_ACTIVATE)
+    assert ros.change('recorder', 'activate')
     recorder.hear(publisher, 4.0, received=2)
-    assert change(Transition.TRANSITION_DEACTIVATE)
-    assert change(Transition.TRANSITION_CLEANUP)
+    assert ros.change('recorder', 'deactivate', 'cleanup')
     reader = BagReader(recorder.folder)
     assert reader.complete
     assert values(reader) == [2.0, 4.0]
     # The folder is there now, and is not written to again.
-    assert not change(Transition.TRANSITION_CONFIGURE)
+    assert not ros.change('recorder', 'configure')
     assert f'{recorder.folder} exists' in recorder.process.output
     recorder.end()
 
