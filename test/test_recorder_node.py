@@ -230,7 +230,7 @@ def test_a_full_disk_is_told_and_nothing_is_lost_when_there_is_room_again(
     recorder.wait_for('subscribed', '1/1')
     sent = 0
 
-    def send(condition):
+    def fill(condition):
         nonlocal sent
         if not condition():
             for _ in range(20):
@@ -243,7 +243,7 @@ def test_a_full_disk_is_told_and_nothing_is_lost_when_there_is_room_again(
                    and 'No space left on device' in status.message
                    for message in recorder.diagnostics for status in message.status)
 
-    ros.spin_until(lambda: send(failing), 'the disk to be full')
+    ros.spin_until(lambda: fill(failing), 'the disk to be full')
     assert 'No space left on device' in recorder.process.output
     so_far = read_by_rosbags(small_disk / 'bag')
     assert so_far == list(range(len(so_far)))
