@@ -5,11 +5,11 @@ import math
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from plants import Plant
 import pytest
 
 from hmsa.errors import BadInputError
 from hmsa.model.creep import Creep
-from hmsa.model.equations import natural_frequency
 from hmsa.model.parameters import NondimensionalParameters, paper_actuator
 from hmsa.model.simulation import ActuatorSimulation
 from hmsa.model.status import Code, RefusedError
@@ -36,7 +36,7 @@ class Joint:
         self.actuator = actuator or paper_actuator()
         self.planner = Planner(self.actuator, Options(**options), stretch=stretch)
         self.group = PlannerGroup({'x': self.planner})
-        self.plant = ActuatorSimulation(
+        self.plant = Plant(
             self.actuator, time=START, stretch=stretch,
             slew_limit=options.get('slew_limit', math.inf))
         self.delay = 0
@@ -73,14 +73,9 @@ class Joint:
 
     def advance(self, time, resume=False):
         """Advance the actuator, and report each change of level that takes effect."""
-        plant = self.plant
-        while (stamp := plant.schedule.next_stamp) is not None and stamp <= time:
-            before = plant.schedule.current
-            plant.advance(stamp)
-            if plant.schedule.current != before \
-                    and self.news(plant.time, plant.schedule.current) and resume:
+        for change in self.plant.go_on(time):
+            if self.news(*change) and resume:
                 self.resume()
-        plant.advance(time)
 
     def resume(self):
         if not self.group.may_resume('x'):
@@ -89,11 +84,6 @@ class Joint:
         assert self.stops or not found.refusal
         self.group.resume('x', found, self.now)
         return found
-
-    def residual(self, stretch):
-        frequency = float(natural_frequency(stretch, self.actuator.nondimensional))
-        return math.hypot(
-            self.plant.stretch - stretch, self.plant.rate * self.actuator.time_unit / frequency)
 
 
 def group(**options):
@@ -237,7 +227,7 @@ def test_late_command_is_taken_in_and_the_end_is_at_rest(zeta, late, hardware):
     # What was on its way behind it is late, too.
     assert joint.deviations
     assert all(x.late > 0 for x in joint.deviations)
-    assert joint.residual(1.2) < 0.2 * RESIDUAL
+    assert joint.plant.residual(1.2) < 0.2 * RESIDUAL
 
 
 def test_without_planning_anew_a_late_command_leaves_vibration():
@@ -247,7 +237,7 @@ def test_without_planning_anew_a_late_command_leaves_vibration():
     joint.delay = 7 * MS
     joint.wait(20, resume=False)
     assert len(joint.deviations) == 1
-    assert joint.residual(1.2) > 1e-3
+    assert joint.plant.residual(1.2) > 1e-3
     # The prediction knows it all the same.
     assert joint.planner.state(joint.now).stretch == pytest.approx(joint.plant.stretch, abs=1e-7)
 
@@ -264,7 +254,7 @@ def test_the_rest_of_a_sequence_keeps_its_times():
     assert [x.since for x in anew.segments] == [x.since for x in plan.segments]
     for segment, step in zip(anew.segments, (0.1, 0.1, 0.2), strict=True):
         joint.wait((segment.arrival - joint.now) / MS)
-        assert joint.residual(segment.stretch) < step * RESIDUAL
+        assert joint.plant.residual(segment.stretch) < step * RESIDUAL
 
 
 def test_setpoint_there_is_no_time_left_for_is_left_out():
@@ -312,7 +302,7 @@ def test_missed_levels_are_dropped_and_the_rest_is_planned_from_what_happens():
     found = joint.resume()
     assert found.draft.segments[-1].stretch == 1.4
     joint.wait(120)
-    assert joint.residual(1.4) < 0.4 * RESIDUAL
+    assert joint.plant.residual(1.4) < 0.4 * RESIDUAL
 
 
 def test_lost_command_is_noticed_by_the_next_one():
@@ -327,7 +317,7 @@ def test_lost_command_is_noticed_by_the_next_one():
     assert [x.stamp for x in joint.planner.plan.levels][1:] == [second.stamp]
     joint.resume()
     joint.wait(100)
-    assert joint.residual(1.2) < 0.2 * RESIDUAL
+    assert joint.plant.residual(1.2) < 0.2 * RESIDUAL
     assert first not in joint.planner.plan.levels
 
 
@@ -359,7 +349,7 @@ def test_foreign_level_is_taken_in():
         joint.plant.stretch, abs=1e-7)
     joint.resume()
     joint.wait(100)
-    assert joint.residual(1.2) < 0.2 * RESIDUAL
+    assert joint.plant.residual(1.2) < 0.2 * RESIDUAL
 
 
 def test_news_as_planned_is_no_deviation():
@@ -414,7 +404,7 @@ def test_whatever_is_late_the_prediction_follows_and_the_end_is_at_rest(delays, 
     if joint.planner.plan.segments:
         joint.planner.stop(joint.now)
         joint.wait(60)
-        assert joint.residual(joint.planner.plan.segments[-1].stretch) < RESIDUAL
+        assert joint.plant.residual(joint.planner.plan.segments[-1].stretch) < RESIDUAL
 
 
 def test_commands_that_are_late_for_ever_are_not_planned_anew_for_ever():
@@ -432,7 +422,7 @@ def test_commands_that_are_late_for_ever_are_not_planned_anew_for_ever():
     assert joint.resume().draft is not None
     joint.wait(100)
     assert len(joint.deviations) == count
-    assert joint.residual(1.3) < 0.1 * RESIDUAL
+    assert joint.plant.residual(1.3) < 0.1 * RESIDUAL
 
 
 # -- taking over, and other models --------------------------------------------------------------
@@ -459,7 +449,7 @@ def test_another_planner_takes_over_from_the_state_in_force(hardware, wait):
     joint.wait(200)
     assert len(joint.deviations) <= ahead
     assert all(x.foreign for x in joint.deviations)
-    assert joint.residual(1.25) < 0.2 * RESIDUAL
+    assert joint.plant.residual(1.25) < 0.2 * RESIDUAL
 
 
 def test_rest_is_believed_where_the_model_would_have_it_move():

@@ -6,13 +6,13 @@ import math
 from core_oracle import follow, holding_load
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from plants import Plant
 import pytest
 
 from hmsa.errors import BadInputError
-from hmsa.model.equations import elastic_force, natural_frequency
+from hmsa.model.equations import elastic_force
 from hmsa.model.moves import Setpoint
 from hmsa.model.parameters import NondimensionalParameters, paper_actuator
-from hmsa.model.simulation import ActuatorSimulation
 from hmsa.model.status import Code, RefusedError
 from hmsa.planning.planner import Options, Planner
 from hmsa.planning.sequence import plan_sequence
@@ -36,7 +36,7 @@ class Rig:
     def __init__(self, *, zeta=0.2, stretch=1.0, tick=2 * MS, **options):
         self.actuator = paper_actuator(NondimensionalParameters(zeta=zeta))
         self.planner = Planner(self.actuator, Options(**options), stretch=stretch)
-        self.simulation = ActuatorSimulation(
+        self.simulation = Plant(
             self.actuator, time=START, stretch=stretch,
             slew_limit=options.get('slew_limit', math.inf))
         self.now = START
@@ -89,10 +89,7 @@ class Rig:
         assert self.at_rest(stretch, step)
 
     def at_rest(self, stretch, step=0.1):
-        simulation = self.simulation
-        frequency = float(natural_frequency(stretch, self.actuator.nondimensional))
-        rate = simulation.rate * self.actuator.time_unit / frequency
-        return math.hypot(simulation.stretch - stretch, rate) < RESIDUAL * step
+        return self.simulation.residual(stretch) < RESIDUAL * step
 
 
 def refused(code, reason, attempt):

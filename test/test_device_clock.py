@@ -50,14 +50,9 @@ class Apart(Bench):
             self.cut, self.cut_at = True, there
 
     def advance(self):
-        plant = self.plant
-        while (stamp := plant.schedule.next_stamp) is not None and stamp <= self.now:
-            before = plant.schedule.current
-            plant.advance(stamp)
-            if plant.schedule.current != before:
-                self.levels.append((self.now, plant.schedule.current))
-                self.runtime.applied('a', plant.time + self.ahead, plant.schedule.current)
-        plant.advance(self.now)
+        for stamp, level in self.plant.go_on(self.now):
+            self.levels.append((self.now, level))
+            self.runtime.applied('a', stamp + self.ahead, level)
 
     def set_device(self, by):
         """Set the clock of the device: what waits in it applies by the clock as it is now."""

@@ -1,11 +1,11 @@
 """The planner node with several joints, late commands, and a predecessor and successor."""
 
 from dataclasses import replace
-import math
 import signal
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
+from plants import Plant
 import pytest
 from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
@@ -15,9 +15,7 @@ from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 from hmsa.interfaces import topics
-from hmsa.model.equations import natural_frequency
 from hmsa.model.parameters import paper_actuator
-from hmsa.model.simulation import ActuatorSimulation
 from hmsa.planning.planner import Options, Planner
 from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.conversions import (
@@ -49,9 +47,7 @@ class Driver:
     """An actuator and its coil controlled by the test, which reports levels that take effect."""
 
     def __init__(self, ros: Any, joint: str = '', joints: tuple[str, ...] = ('',)) -> None:
-        self.actuator = paper_actuator()
-        self.plant = ActuatorSimulation(self.actuator, time=START)
-        self.told: list[tuple[int, float]] = []
+        self.plant = Plant(paper_actuator(), time=START)
         self.arrived: list[tuple[int, float]] = []
         self.received = 0
         self.hold_back = False
@@ -82,14 +78,8 @@ class Driver:
 
     def advance(self, time: int) -> None:
         """Advance the actuator, and report levels that take effect."""
-        plant = self.plant
-        while (stamp := plant.schedule.next_stamp) is not None and stamp <= time:
-            before = plant.schedule.current
-            plant.advance(stamp)
-            if plant.schedule.current != before:
-                self.told.append((plant.time, plant.schedule.current))
-                self.applied.publish(to_command(*self.told[-1], 'coil'))
-        plant.advance(time)
+        for change in self.plant.go_on(time):
+            self.applied.publish(to_command(*change, 'coil'))
 
     def sample(self, name: str = 'actuator') -> JointState:
         """Return the actual state."""
@@ -97,12 +87,6 @@ class Driver:
             header=to_command(self.plant.time, 0.0, '').header, name=[name],
             position=[self.plant.stretch], velocity=[self.plant.rate],
             effort=[self.plant.flux_density])
-
-    def residual(self, stretch: float) -> float:
-        """Return the deviation from rest at a stretch."""
-        frequency = float(natural_frequency(stretch, self.actuator.nondimensional))
-        return math.hypot(
-            self.plant.stretch - stretch, self.plant.rate * self.actuator.time_unit / frequency)
 
 
 class Rig:
@@ -291,7 +275,7 @@ def test_first_request_waits_for_the_state_in_force(rig, ros):
     assert point[0].effort[0] == 0.06
     assert (point[0].positions[0], point[0].velocities[0]) == (1.15, 3.0)
     planner.run(START + 150 * MS)
-    assert driver.residual(1.25) < 0.1 * RESIDUAL
+    assert driver.plant.residual(1.25) < 0.1 * RESIDUAL
 
 
 @pytest.mark.slow
@@ -358,7 +342,7 @@ def test_planner_that_is_killed_is_followed_by_one_that_takes_over(ros, start, m
     ros.spin_until(sent_on, 'its first command')
     assert driver.plant.schedule.current == before
     let_run(150)
-    assert driver.residual(1.2) < 0.1 * RESIDUAL
+    assert driver.plant.residual(1.2) < 0.1 * RESIDUAL
     assert second.stop(signal.SIGINT) == 0
 
 
@@ -369,7 +353,7 @@ def test_late_command_is_noticed_and_the_rest_planned_anew(rig):
     # A block that vibrates for long: with another, doing nothing leaves as little.
     planner = rig('-p', f'actuator.damping_coefficient:={SLENDER.damping_coefficient}')
     driver = planner.driver
-    driver.actuator, driver.plant = SLENDER, ActuatorSimulation(SLENDER, time=START)
+    driver.plant = Plant(SLENDER, time=START)
     hold = 3 * SPELL
     planner.send(to_trajectory(
         [(1.1 + 0.1 * (k % 2), (k + 1) * hold) for k in range(12)], 'actuator'))
@@ -386,7 +370,7 @@ def test_late_command_is_noticed_and_the_rest_planned_anew(rig):
     assert int(planner.values()['late']) >= 1
     planner.run(START + LEAD + 12 * hold)
     planner.verdict(setpoint=12, setpoints=12, stretch='1.2', plan=1)
-    assert driver.residual(1.2) < 0.2 * RESIDUAL
+    assert driver.plant.residual(1.2) < 0.2 * RESIDUAL
 
 
 # -- what nobody should send --------------------------------------------------------------------
@@ -436,7 +420,7 @@ def test_deactivated_it_comes_to_rest_and_activated_again_it_takes_over(rig, ros
     driver.advance(START + 500 * MS)
     rest = driver.plant.stretch
     assert 1.0 < rest < 1.1
-    assert driver.residual(rest) < 0.1 * RESIDUAL
+    assert driver.plant.residual(rest) < 0.1 * RESIDUAL
     planner.at(START + 500 * MS)
     samples = ros.publisher(JointState, 'joint_states', 10, subscribers=0)
     ros.spin_until(lambda: planner.planner.count_publishers('joint_states'), 'the publisher')
@@ -453,7 +437,7 @@ def test_deactivated_it_comes_to_rest_and_activated_again_it_takes_over(rig, ros
         planner.at(START + 500 * MS + k * 5 * MS)
         ros.executor.spin_once(0.005)
         driver.advance(planner.now)
-    assert driver.residual(1.3) < 0.3 * RESIDUAL
+    assert driver.plant.residual(1.3) < 0.3 * RESIDUAL
     assert ros.change('planner', 'deactivate', 'cleanup')
     ros.spin_until(
         lambda: not ros.node.count_publishers('flux_density_command'), 'the end of the topics')

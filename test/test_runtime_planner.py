@@ -2,17 +2,15 @@
 
 from contextlib import contextmanager
 from dataclasses import replace
-import math
 from threading import Semaphore, Thread
 
 from at_work import AtWork, MS, planner, sample, START
 import numpy as np
+from plants import Plant
 import pytest
 
 from hmsa.errors import HmsaError
-from hmsa.model.equations import natural_frequency
 from hmsa.model.parameters import paper_actuator
-from hmsa.model.simulation import ActuatorSimulation
 from hmsa.model.status import Code, RefusedError
 from hmsa.planning import proceed
 from hmsa.planning.planner import Options, Planner
@@ -98,7 +96,7 @@ class Rig(AtWork):
             observable=lambda: self.observable, unheard=lambda: self.unheard,
             found=lambda joint: self.found)
         self.plants = {
-            x: ActuatorSimulation(block, time=START) for x, block in self.blocks.items()}
+            x: Plant(block, time=START) for x, block in self.blocks.items()}
         self.sent = []
         self.wire = []
         self.transport = 0
@@ -149,14 +147,8 @@ class Rig(AtWork):
     def advance(self):
         """Advance the actuators, and report levels that take effect."""
         for name, plant in self.plants.items():
-            now = self.now - self.set_by
-            while (stamp := plant.schedule.next_stamp) is not None and stamp <= now:
-                before = plant.schedule.current
-                plant.advance(stamp)
-                if plant.schedule.current != before:
-                    self.runtime.applied(
-                        name, plant.time + self.set_by, plant.schedule.current)
-            plant.advance(now)
+            for stamp, level in plant.go_on(self.now - self.set_by):
+                self.runtime.applied(name, stamp + self.set_by, level)
 
     def run(self, end, step=2 * MS):
         while self.now < end:
@@ -211,10 +203,7 @@ class Rig(AtWork):
                 self.now - age, plant.stretch, plant.rate, plant.flux_density, came=self.now))
 
     def residual(self, stretch, joint='a'):
-        plant, block = self.plants[joint], self.blocks[joint]
-        frequency = float(natural_frequency(stretch, block.nondimensional))
-        return math.hypot(
-            plant.stretch - stretch, plant.rate * block.time_unit / frequency)
+        return self.plants[joint].residual(stretch)
 
 
 # -- requests -----------------------------------------------------------------------------------
