@@ -56,6 +56,25 @@ def write_with_mcap(path, count=400, **options):
     return path
 
 
+def write_raw(path, encoding='cdr', stamp=1):
+    """Write a file of one message without a schema, as other programs do."""
+    with path.open('wb') as file:
+        writer = Writer(file)
+        writer.start('ros2', 'test')
+        channel = writer.register_channel('/a', encoding, 0, {})
+        writer.add_message(channel, stamp, payload(1), stamp)
+        writer.finish()
+    return path
+
+
+def flip_a_bit(path):
+    """Flip a bit in the second chunk of a file."""
+    data = bytearray(path.read_bytes())
+    chunks = [offset for opcode, offset, _ in pieces(bytes(data)) if opcode == Opcode.CHUNK]
+    data[chunks[1] + 100] ^= 0x10
+    path.write_bytes(data)
+
+
 def stamps(path):
     """Read a file, and return reader and log times; only the package's errors may occur."""
     reader = BagReader(path)
@@ -101,11 +120,8 @@ def test_a_cut_bag_is_recovered_for_every_reader(tmp_path):
 @pytest.mark.parametrize('preset', ['none', 'zstd_fast', 'lz4'])
 def test_a_flipped_byte_in_a_chunk_costs_that_chunk(tmp_path, preset):
     path = write_bag(tmp_path / 'bag', preset=preset)
-    data = bytearray(path.read_bytes())
     _, intact = stamps(path)
-    chunks = [offset for opcode, offset, _ in pieces(bytes(data)) if opcode == Opcode.CHUNK]
-    data[chunks[1] + 100] ^= 0x10
-    path.write_bytes(data)
+    flip_a_bit(path)
     reader, got = stamps(path)
     assert 0 < len(got) < len(intact)
     assert set(got) < set(intact)
@@ -408,27 +424,14 @@ def test_a_bag_of_no_messages_is_a_bag(tmp_path, capsys):
 
 
 def test_messages_that_never_saw_a_clock_are_read(tmp_path):
-    path = tmp_path / 'zero.mcap'
-    with path.open('wb') as file:
-        writer = Writer(file)
-        writer.start('ros2', 'test')
-        channel = writer.register_channel('/a', 'cdr', 0, {})
-        writer.add_message(channel, 0, payload(1), 0)
-        writer.finish()
-    reader, got = stamps(path)
+    reader, got = stamps(write_raw(tmp_path / 'zero.mcap', stamp=0))
     assert got == [0]
     assert (reader.start_time, reader.end_time, reader.counts()) == (0, 0, {'/a': 1})
 
 
 @pytest.mark.parametrize('encoding', ['cdr', 'json'])
 def test_a_missing_schema_leaves_the_messages_raw(tmp_path, encoding):
-    path = tmp_path / 'raw.mcap'
-    with path.open('wb') as file:
-        writer = Writer(file)
-        writer.start('ros2', 'test')
-        channel = writer.register_channel('/a', encoding, 0, {})
-        writer.add_message(channel, 1, payload(1), 1)
-        writer.finish()
+    path = write_raw(tmp_path / 'raw.mcap', encoding)
     reader, got = stamps(path)
     assert got == [1]
     recover(path, tmp_path / 'whole')
@@ -440,21 +443,16 @@ def test_a_missing_schema_leaves_the_messages_raw(tmp_path, encoding):
     assert not list(read_messages(path))
 
 
-def test_a_definition_that_cannot_be_read_is_named(tmp_path):
+@pytest.mark.parametrize(('topic', 'data', 'said'), [
+    (BagTopic('/a', 'x/msg/Y', 'nonsense ::: here\n'), payload(1),
+     'definition of x/msg/Y in the bag cannot be read'),
+    (BagTopic('/a', FLOAT, *reversed(message_definition(FLOAT))), bytes((0, 1, 0, 0, 1)),
+     'does not decode as std_msgs/msg/Float64')])
+def test_a_definition_or_payload_that_cannot_be_read_is_named(tmp_path, topic, data, said):
     with BagWriter(tmp_path / 'bag') as writer:
-        number = writer.add_topic(BagTopic('/a', 'x/msg/Y', 'nonsense ::: here\n'))
-        writer.write([(number, 1, 1, 1, payload(1))])
-    with pytest.raises(BagError, match='definition of x/msg/Y in the bag cannot be read'):
+        writer.write([(writer.add_topic(topic), 1, 1, 1, data)])
+    with pytest.raises(BagError, match=said):
         list(read_messages(tmp_path / 'bag', ['/a']))
-
-
-def test_a_payload_that_does_not_fit_is_named(tmp_path):
-    encoding, text = message_definition(FLOAT)
-    with BagWriter(tmp_path / 'bag') as writer:
-        number = writer.add_topic(BagTopic('/a', FLOAT, text, encoding))
-        writer.write([(number, 1, 1, 1, bytes((0, 1, 0, 0, 1)))])
-    with pytest.raises(BagError, match='does not decode as std_msgs/msg/Float64'):
-        list(read_messages(tmp_path / 'bag'))
 
 
 def test_a_topic_that_is_not_there_is_named(tmp_path):
@@ -495,11 +493,7 @@ def test_metadata_that_cannot_be_opened_are_named(tmp_path):
 
 
 def test_a_message_lost_from_a_chunk_is_said_by_recover(tmp_path, capsys):
-    path = write_bag(tmp_path / 'bag')
-    data = bytearray(path.read_bytes())
-    chunks = [offset for opcode, offset, _ in pieces(bytes(data)) if opcode == Opcode.CHUNK]
-    data[chunks[1] + 100] ^= 0x10
-    path.write_bytes(data)
+    flip_a_bit(write_bag(tmp_path / 'bag'))
     assert main(['bag', 'recover', str(tmp_path / 'bag'), '--out', str(tmp_path / 'new')]) == 0
     assert 'of 400 messages cannot be read' in capsys.readouterr().err
     assert main(['bag', 'info', str(tmp_path / 'bag')]) == 1
