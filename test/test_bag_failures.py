@@ -30,6 +30,15 @@ def message(i, size=0):
     return (0, i, i, i, PAYLOAD + bytes(size))
 
 
+def recording_in(place, reports=None, *, topic=TOPIC, **limits):
+    """Return a recording of a topic in a folder or with a writer; reports are (failure, text)."""
+    recording = WriterThread(
+        BagWriter(place) if isinstance(place, Path) else place, RecordingLimits(**limits),
+        *() if reports is None else [lambda text, failure: reports.append((failure, text))])
+    recording.add_topic(topic)
+    return recording
+
+
 @contextmanager
 def file_limit() -> Iterator[None]:
     """Limit the files of this process to 300 kB, as a quota would."""
@@ -45,10 +54,8 @@ def file_limit() -> Iterator[None]:
 
 def test_when_a_file_may_not_grow_the_next_takes_over(tmp_path):
     reports = []
-    recording = WriterThread(
-        BagWriter(tmp_path / 'bag', chunk_size=20_000), RecordingLimits(flush_period=0.05),
-        lambda sentence, failure: reports.append((failure, sentence)))
-    recording.add_topic(TOPIC)
+    writer = BagWriter(tmp_path / 'bag', chunk_size=20_000)
+    recording = recording_in(writer, reports, flush_period=0.05)
     with file_limit():
         recording.put([message(i, 100) for i in range(10_000)], 1_000_000)
         status = recording.close()
@@ -82,10 +89,7 @@ def test_a_write_that_fails_takes_room_for_the_end_again(tmp_path, monkeypatch):
 
 def test_a_removed_folder_costs_what_was_in_it_and_that_is_counted(tmp_path, wait_until):
     reports = []
-    recording = WriterThread(
-        BagWriter(tmp_path / 'bag'), RecordingLimits(flush_period=0.02),
-        lambda sentence, failure: reports.append((failure, sentence)))
-    recording.add_topic(TOPIC)
+    recording = recording_in(tmp_path / 'bag', reports, flush_period=0.02)
     recording.put([message(i) for i in range(10)], 50)
     wait_until(lambda: recording.status().written == {'/a': 10}, 'the first messages')
     shutil.rmtree(tmp_path / 'bag')
@@ -104,8 +108,7 @@ def test_a_removed_folder_costs_what_was_in_it_and_that_is_counted(tmp_path, wai
 @pytest.mark.parametrize('damage', ['removed', 'shortened'])
 def test_at_the_end_what_can_be_read_is_counted(tmp_path, damage, when):
     writer = BagWriter(tmp_path / 'bag', chunk_size=1000)
-    recording = WriterThread(writer, RecordingLimits(flush_period=0.02))
-    recording.add_topic(TOPIC)
+    recording = recording_in(writer, flush_period=0.02)
 
     def record(first):
         recording.put([message(i) for i in range(first, first + 100)], 500)
@@ -149,8 +152,7 @@ def test_at_the_end_what_can_be_read_is_counted(tmp_path, damage, when):
 
 
 def test_what_does_not_fit_into_memory_is_counted_by_topic(tmp_path):
-    recording = WriterThread(BagWriter(tmp_path / 'bag'), RecordingLimits(cache_size=10_000))
-    recording.add_topic(TOPIC)
+    recording = recording_in(tmp_path / 'bag', cache_size=10_000)
     recording.put([message(i) for i in range(1000)], 5000)
     recording.put([message(i) for i in range(10)], 50)
     status = recording.close()
@@ -159,8 +161,7 @@ def test_what_does_not_fit_into_memory_is_counted_by_topic(tmp_path):
 
 
 def test_a_writer_that_cannot_write_at_the_end_says_so(tmp_path):
-    recording = WriterThread(BagWriter(tmp_path / 'bag'), RecordingLimits(flush_period=60.0))
-    recording.add_topic(TOPIC)
+    recording = recording_in(tmp_path / 'bag', flush_period=60.0)
     recording.put([message(i) for i in range(10)], 50)
     shutil.rmtree(tmp_path / 'bag')
     (tmp_path / 'bag').write_text('in the way')
@@ -197,8 +198,7 @@ def test_limits_out_of_range_are_refused(options, match):
 
 
 def test_files_are_split_by_time_span(tmp_path):
-    recording = WriterThread(BagWriter(tmp_path / 'bag'), RecordingLimits(max_duration_ns=100))
-    recording.add_topic(TOPIC)
+    recording = recording_in(tmp_path / 'bag', max_duration_ns=100)
     recording.put([message(i) for i in range(1000)], 5000)
     recording.close()
     stored = metadata.read(tmp_path / 'bag' / 'metadata.yaml')
@@ -207,8 +207,7 @@ def test_files_are_split_by_time_span(tmp_path):
 
 
 def test_a_snapshot_reaches_back_as_far_as_asked_for(tmp_path):
-    recording = WriterThread(BagWriter(tmp_path / 'bag'), RecordingLimits(snapshot_ns=100))
-    recording.add_topic(TOPIC)
+    recording = recording_in(tmp_path / 'bag', snapshot_ns=100)
     for i in range(500):
         recording.put([message(i)], 5)
     assert recording.snapshot() == '101 messages written'
@@ -218,9 +217,7 @@ def test_a_snapshot_reaches_back_as_far_as_asked_for(tmp_path):
 
 
 def test_messages_that_a_snapshot_has_no_room_for_are_counted(tmp_path):
-    recording = WriterThread(
-        BagWriter(tmp_path / 'bag'), RecordingLimits(snapshot_ns=10**9, cache_size=3000))
-    recording.add_topic(TOPIC)
+    recording = recording_in(tmp_path / 'bag', snapshot_ns=10**9, cache_size=3000)
     recording.put([message(0)], 5)
     recording.put([message(i) for i in range(1, 101)], 500)
     assert recording.status().queued_bytes == 0
@@ -267,9 +264,9 @@ def test_a_killed_writer_loses_nothing_it_has_flushed(tmp_path):
 
 def test_files_that_are_full_at_once_do_not_hold_up_the_writing(tmp_path):
     definition = 'uint8 data\n' * 2000
-    recording = WriterThread(
-        BagWriter(tmp_path / 'bag'), RecordingLimits(flush_period=0.05, max_size=1024))
-    recording.add_topic(BagTopic('/a', 'std_msgs/msg/UInt8', definition))
+    recording = recording_in(
+        tmp_path / 'bag', flush_period=0.05, max_size=1024,
+        topic=BagTopic('/a', 'std_msgs/msg/UInt8', definition))
     recording.put([message(i) for i in range(20_000)], 100_000)
     status = recording.close()
     assert status.written == {'/a': 20_000}
@@ -280,8 +277,9 @@ def test_files_that_are_full_at_once_do_not_hold_up_the_writing(tmp_path):
 
 
 def test_what_is_declared_is_no_part_of_the_size_of_a_file(tmp_path):
-    recording = WriterThread(BagWriter(tmp_path / 'bag'), RecordingLimits(max_size=1024))
-    recording.add_topic(BagTopic('/a', 'std_msgs/msg/UInt8', 'uint8 data\n' * 2000))
+    recording = recording_in(
+        tmp_path / 'bag', max_size=1024,
+        topic=BagTopic('/a', 'std_msgs/msg/UInt8', 'uint8 data\n' * 2000))
     recording.put([message(i) for i in range(100)], 500)
     recording.close()
     assert [file.message_count for file in metadata.read(
@@ -289,8 +287,7 @@ def test_what_is_declared_is_no_part_of_the_size_of_a_file(tmp_path):
 
 
 def test_time_that_jumps_to_and_fro_does_not_make_a_file_each_time(tmp_path):
-    recording = WriterThread(BagWriter(tmp_path / 'bag'), RecordingLimits())
-    recording.add_topic(TOPIC)
+    recording = recording_in(tmp_path / 'bag')
     for i in range(500):
         recording.put([message(i)], 5)
         recording.begin_anew()
@@ -302,8 +299,7 @@ def test_time_that_jumps_to_and_fro_does_not_make_a_file_each_time(tmp_path):
 @pytest.mark.slow
 def test_an_end_that_takes_too_long_is_cut_off_and_counted(tmp_path, monkeypatch):
     monkeypatch.setattr('hmsa.bag.writer_thread.END_SECONDS', 0.0)
-    recording = WriterThread(BagWriter(tmp_path / 'bag'), RecordingLimits())
-    recording.add_topic(TOPIC)
+    recording = recording_in(tmp_path / 'bag')
     for i in range(200_000):
         recording.put([message(i)], 5)
     status = recording.close()
@@ -334,8 +330,7 @@ def test_a_split_that_fails_loses_no_message(tmp_path, monkeypatch):
         return BagWriter.split(writer)
 
     monkeypatch.setattr(writer, 'split', split)
-    recording = WriterThread(writer, RecordingLimits(max_size=1024))
-    recording.add_topic(TOPIC)
+    recording = recording_in(writer, max_size=1024)
     recording.put([message(i) for i in range(100)], 500)
     recording.close()
     assert len(splits) > 1
