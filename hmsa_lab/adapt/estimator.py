@@ -454,20 +454,16 @@ class Estimator:
         return f'samples fit only with an implausible {" and ".join(names)}' if names else ''
 
     def _go_along(self, window: Window, found: Solution, until: float) -> None:
-        """Drop the oldest samples or, without new ones, move the window in time."""
+        """Drop the oldest samples."""
         here, count = found.here, len(window.time)
         span = _LONGEST * here.values['time_unit']
         # A whole move is fitted at once, since early in one linearisation would be inaccurate.
         before = int(np.searchsorted(window.time, self._seconds(self._move_begins(until))))
         if before > 1:
             place = before - 1
-        elif count and until - float(window.time[-1]) > span:
-            place = count
         elif count > self.options.window or (
                 count >= _FEWEST and float(window.time[-1]) - window.begin > span):
             place = int((1.0 - _KEPT) * count)
-        elif count == 0 and until - window.begin > span:
-            place = 0
         elif count and TEMPERATURE in self.prior.free and self._rests(float(window.time[-1])):
             # Its equilibrium follows the temperature.
             place = count - 1
