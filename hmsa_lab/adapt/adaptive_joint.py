@@ -20,7 +20,6 @@ from hmsa_lab.adapt.expected_error import clearly_better
 from hmsa_lab.adapt.learnt import (
     as_of_path,
     differs,
-    excludes,
     initial_state,
     learnt_model,
     same_parameters,
@@ -419,8 +418,8 @@ class AdaptiveJoint:
             trust.recover(given=False)
             self._restart(self.estimator.since, healthy=True)
             return True
-        if not differences(found, self.prior.values) and (
-                trust.confirmed is None or excludes(found, trust.confirmed)):
+        if not differences(found, self.prior.values) and differences(
+                found, self._as_identified(trust.confirmed or self.given).values):
             # Samples need neither what was learnt nor another sensor.
             trust.recover(given=True)
             self.used = self.given

@@ -38,8 +38,6 @@ _OTHERS = ('coil_time_constant', 'stretch_bias', 'stretch_gain')
 # which such a figure counts as determined.
 _SENSOR = {'stretch_bias': 'bias', 'stretch_gain': 'gain', 'sensor_latency': 'latency'}
 _FOUND = 0.3
-# Standard deviations beyond which a value is excluded.
-_EXCLUDED = 3.0
 # A bias of fewer standard deviations is not significant.
 _SHOWS = 3.0
 
@@ -94,14 +92,6 @@ def differs(model: JointModel, estimate: StateEstimate) -> bool:
         if abs(value - before) > max(_NEWS * abs(value), _SURE * estimate.deviations[key]):
             return True
     return False
-
-
-def excludes(estimate: StateEstimate, model: JointModel) -> bool:
-    """Return whether an estimate excludes one of the parameters of a model."""
-    return any(
-        abs(estimate.values[x] - float(getattr(model.options, x, getattr(
-            model.actuator, x, estimate.values[x])))) > _EXCLUDED * estimate.deviations[x]
-        + _NEWS * abs(estimate.values[x]) for x in estimate.free)
 
 
 def same_parameters(model: JointModel, other: JointModel) -> bool:
