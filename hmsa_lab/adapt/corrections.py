@@ -41,8 +41,6 @@ if TYPE_CHECKING:
 # Minimum gain of a correction as a fraction of the step, and the smaller one during a move that
 # has time for corrections: an actuator at rest is not moved for a small gain.
 _GAIN, _LITTLE = 5e-4, 5e-5
-# Minimum gain as a fraction of the noise of a sample.
-_NOISE = 0.02
 # Time scales before its end from which a move is no longer corrected.
 _SHORTEST = 0.3
 # Duration of a move, relative to lead_time, from which extending it leaves time to correct it: in
@@ -303,7 +301,7 @@ def _gains(joint: AdaptiveJoint, arrival: int, draft: Draft | None) -> Draft | N
     for each, least in ((doubted, hidden), (estimate, 0.0)):
         before = expect(each, course, slew, segment.arrival or 0)
         after = expect(each, _drafted(draft, planner.plan), slew)
-        if not worthwhile(before, after, max(gain, least, uneven, _NOISE * estimate.noise)):
+        if not worthwhile(before, after, max(gain, least, uneven)):
             return None
     joint.after = after.size
     return draft
@@ -343,7 +341,7 @@ def _nearer(
     path = plan.segments[plan.under_way(estimate.time)].path
     span = 0.0 if path is None else float(np.ptp(path.course(path.breaks)[0]))
     return worthwhile(
-        before, after, max(_GAIN * span, _NOISE * estimate.noise),
+        before, after, _GAIN * span,
         SHARE if joint.adapted(joint.based(plan.level(estimate.time).model)) else CLEARLY)
 
 
