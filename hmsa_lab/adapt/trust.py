@@ -40,8 +40,7 @@ class Trust:
         self.rang = False
         self.ended = False  # whether learnt parameters made moves worse
         self._begin, self._doubts, self._rejected = begin, 0, 0
-        # Number of estimates that fitted a move and failed later; number of moves still to fit.
-        self._failures, self._moves = 0, 1
+        self._failed = False  # whether an estimate that fitted has failed later
 
     def doubt(
             self, why: str, now: int, *, used: bool = True, fitted: bool = False,
@@ -49,8 +48,7 @@ class Trust:
         """
         Record that samples do not fit at a time in ns; return whether to restart.
 
-        An estimate that earlier samples ``fitted`` has failed. Those that acted are counted, if
-        plans ``used`` them.
+        An estimate that earlier samples ``fitted`` has failed, or one that plans ``used``.
         """
         if self.ended:
             return False
@@ -59,11 +57,9 @@ class Trust:
         # The first samples of a motion, which are few, may not fit yet.
         if (self.acts or not self.beginnings) and self._doubts < _PERSISTENT and not at_once:
             return False
-        self._failures = max(self._failures + (self.acts and used), fitted)
+        self._failed |= fitted or self.acts and used
         self.beginnings += 1
         self.acts, self._begin, self._doubts = False, now, 0
-        # From the second failure on, each one doubles the number of moves that must fit.
-        self._moves = 2 ** max(self._failures - 1, 0)
         return True
 
     def fits(
@@ -86,8 +82,7 @@ class Trust:
                 self._begin, self._rejected = now, rejected
                 if many:
                     return self.doubt('many samples of a move do not fit', now)
-                self._moves -= 1
-                self.acts = self._moves == 0
+                self.acts = True
         if self.acts or not self.beginnings:
             self.why = ''
         return False
@@ -100,7 +95,7 @@ class Trust:
     @property
     def failed(self) -> bool:
         """Whether an estimate in use has failed to fit later samples, after one was confirmed."""
-        return self._failures > 0 and self.confirmed is not None
+        return self._failed and self.confirmed is not None
 
     def restarted(self, rejected: int, begin: int) -> None:
         """
@@ -112,11 +107,11 @@ class Trust:
 
     def wait(self, now: int) -> None:
         """Use the estimate after another move that fits."""
-        self.acts, self._begin, self._moves = False, now, 1
+        self.acts, self._begin = False, now
 
     def recover(self, *, given: bool) -> None:
         """Forget failures: the sensor is as it was; with the ``given`` parameters if so."""
-        self._failures = 0
+        self._failed = False
         if given:
             self.confirmed = None
 
