@@ -331,10 +331,10 @@ class AdaptiveJoint:
             trust.wait(now)
         self._anew &= found is None
         acted = trust.acts
-        if trust.doubt(
-                trouble, now, used=not self.sensor_changed, fitted=self._fitted > 0
-        ) if trouble else found is not None and not lacks and trust.fits(
-                plan, self._pace, estimator, now, waits=now < self.waits):
+        if found is not None and not (trouble or lacks):
+            trust.fits(plan, self._pace, estimator, now, waits=now < self.waits)
+        if trouble and trust.doubt(
+                trouble, now, used=not self.sensor_changed, fitted=self._fitted > 0):
             if acted:
                 self._tried.clear()
             # Samples that an estimate in use has fitted do not show what has changed since. Until
@@ -379,7 +379,7 @@ class AdaptiveJoint:
         been tried with these samples, later ones are explained. If ``healthy``, the sensor is as
         given, and the actuator as confirmed.
         """
-        model, screening = self.trust.confirmed or self.given, self.estimator.screening
+        model = self.trust.confirmed or self.given
         ways = [False] * (self._learnt or not self.trust.failed) + [True] * self.trust.failed
         left = [x for x in ways if x not in self._tried]
         if healthy:
@@ -397,7 +397,7 @@ class AdaptiveJoint:
         self._since = since
         # The level that has held the block may not have been the one commanded.
         self.estimator.restart(self._as_warm(prior), settled=not (healthy or left))
-        self.trust.restarted(screening.rejected, since)
+        self.trust.begin = since
         for stamp, stretch in self._kept:
             if stamp >= since:
                 self.fresh |= self.estimator.sample(stamp, stretch)

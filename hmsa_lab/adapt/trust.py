@@ -11,8 +11,6 @@ _SHOWN, _FEWEST = 6.0, 10
 # The same of a move slowed down to be corrected: a natural period. The first half of one of a
 # block on finite elements looked like G 46 % too high, and the move then left 117 % of its step.
 _EARLY = 2.5
-# Fraction of the samples of a move that may be rejected.
-_REJECTED = 0.1
 # Largest error, as a fraction of the step, that confirms the parameters of a move.
 _CONFIRMS = 0.02
 
@@ -39,7 +37,8 @@ class Trust:
         # changed, and not its sensor.
         self.rang = False
         self.ended = False  # whether learnt parameters made moves worse
-        self._begin, self._doubts, self._rejected = begin, 0, 0
+        self.begin = begin  # time in ns from which a move has to fit
+        self._doubts = 0
         self._failed = False  # whether an estimate that fitted has failed later
 
     def doubt(
@@ -59,33 +58,26 @@ class Trust:
             return False
         self._failed |= fitted or self.acts and used
         self.beginnings += 1
-        self.acts, self._begin, self._doubts = False, now, 0
+        self.acts, self.begin, self._doubts = False, now, 0
         return True
 
     def fits(
             self, plan: Timeline, unit: float, estimator: Estimator, now: int, *,
-            waits: bool) -> bool:
+            waits: bool) -> None:
         """
-        Record that samples fit at a time in ns; return whether to restart as too few did.
+        Record that samples fit at a time in ns.
 
         The move under way ``waits`` to be corrected, or does not.
         """
         self._doubts = 0
         if self.ended:
-            return False
+            return
         if not self.acts:
-            begin = _next_move(plan, self._begin, now)
-            count, rejected = estimator.count_since(begin), estimator.screening.rejected
+            begin = _next_move(plan, self.begin, now)
             span = round((_EARLY if waits else _SHOWN) * unit * NANOSECONDS)
-            if begin + span <= now and count >= _FEWEST:
-                many = rejected - self._rejected > max(_REJECTED * count, 1)
-                self._begin, self._rejected = now, rejected
-                if many:
-                    return self.doubt('many samples of a move do not fit', now)
-                self.acts = True
+            self.acts = begin + span <= now and estimator.count_since(begin) >= _FEWEST
         if self.acts or not self.beginnings:
             self.why = ''
-        return False
 
     @property
     def doubts(self) -> bool:
@@ -97,17 +89,9 @@ class Trust:
         """Whether an estimate in use has failed to fit later samples, after one was confirmed."""
         return self._failed and self.confirmed is not None
 
-    def restarted(self, rejected: int, begin: int) -> None:
-        """
-        Record that the estimator has restarted with the samples from a time in ns on.
-
-        Rejected samples count from this number on: earlier ones led to the restart.
-        """
-        self._rejected, self._begin = rejected, begin
-
     def wait(self, now: int) -> None:
         """Use the estimate after another move that fits."""
-        self.acts, self._begin = False, now
+        self.acts, self.begin = False, now
 
     def recover(self, *, given: bool) -> None:
         """Forget failures: the sensor is as it was; with the ``given`` parameters if so."""
