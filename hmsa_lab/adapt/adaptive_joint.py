@@ -80,7 +80,6 @@ class AdaptiveJoint:
     prior: Prior = field(init=False)  # of the given parameters
     estimator: Estimator = field(init=False)
     trust: Trust = field(init=False)
-    start: float = field(init=False)  # stretch before the setpoint under way
     ledger: MoveErrors = field(default_factory=MoveErrors)
     moves: Moves = field(default_factory=Moves)  # those of the plan in force
     latest: StateEstimate | None = None
@@ -117,7 +116,6 @@ class AdaptiveJoint:
     _anew: bool = False  # whether samples that have arrived before are explained anew
     # Explanations of these samples that have been tried: whether the sensor has changed.
     _tried: set[bool] = field(default_factory=set)
-    _setpoint: tuple[int, int] = (0, -1)  # number of the plan, and place under way
     _sensor: tuple[StateEstimate, SensorModel] | None = None  # estimate, and its sensor
     _measured: bool = False  # whether the field is measured
     _thermometer: float = field(init=False)  # the newest measured temperature in use
@@ -137,7 +135,6 @@ class AdaptiveJoint:
         self.estimator = Estimator(self.prior, EstimatorOptions(
             slew_limit=given.options.slew_limit, learn=not settings.feedback_frozen))
         self.trust = Trust(begun)
-        self.start = given.actuator.rest
 
     @property
     def _known(self) -> Known:
@@ -312,7 +309,6 @@ class AdaptiveJoint:
         estimator, found = yield from doing(_updated, self.estimator, now)
         estimator.learning, self.estimator = self.estimator.learning, estimator
         screening, trust = estimator.screening, self.trust
-        self._note_start(plan, now)
         trouble = screening.trouble if found is None else found.trouble
         jumped = found is not None and not trouble and found.jumped > _JUMPED
         if jumped:
@@ -454,16 +450,11 @@ class AdaptiveJoint:
             self._take(*sample)
         self._waiting.clear()
 
-    def _note_start(self, plan: Timeline, now: int) -> None:
-        """Store the position of the joint before the setpoint that is under way at a time."""
-        place, before = plan.under_way(now), self._setpoint
-        self._setpoint = plan.number, place
-        if self._setpoint == before:
-            return
-        if plan.number == before[0] and place > before[1] >= 0:
-            self.start = plan.segments[place - 1].stretch
-        else:
-            self.start = plan.levels[0].stretch if self.latest is None else self.latest.stretch
+    def start(self, time: int) -> float:
+        """Return the stretch before the setpoint that is under way at a time."""
+        plan = self.planner.plan
+        place = plan.under_way(time)
+        return (plan.segments[place - 1] if place > 0 else plan.levels[0]).stretch
 
     def _look_at_vibration(self, plan: Timeline, found: StateEstimate) -> None:
         """Update the largest amplitude since the last arrival."""
@@ -580,7 +571,8 @@ class AdaptiveJoint:
                 learnt = as_of_path(learnt, used, latest)
             better = partial(clearly_better, given=used == self.given, shown=not waits)
             if (yield from doing(
-                    better, latest, learnt, used, self.start, segments[-1].stretch)):
+                    better, latest, learnt, used, self.start(latest.time),
+                    segments[-1].stretch)):
                 model = learnt
         if self.acting is None:
             return
@@ -608,12 +600,13 @@ class AdaptiveJoint:
             return 'no estimate yet'
         plan = self.planner.plan
         place = plan.under_way(now)
-        target = plan.segments[place].stretch if place >= 0 else self.start
+        start = self.start(now)
+        target = plan.segments[place].stretch if place >= 0 else start
         use = 'plans do not use it' if self.sensor_changed else (
             'plans use it' if trust.acts else 'plans use it after a move that samples fit')
         words = sentence(
             self.latest, self.prior.values, plan.level(now).flux_density, target,
-            self.start, self.amplitude, use if self.adapts else '')
+            start, self.amplitude, use if self.adapts else '')
         return words + (
             '; the sensor has changed, according to the samples, and plans keep '
             f'{trust.parameters}: check the sensor, or ~/reset_estimate to take it as it is'

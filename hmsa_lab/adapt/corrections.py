@@ -288,11 +288,12 @@ def _gains(joint: AdaptiveJoint, arrival: int, draft: Draft | None) -> Draft | N
     slew = planner.options.slew_limit
     course, gain = course_of(planner.plan, draft.begin, _LITTLE if arrival else _GAIN)
     segment = draft.segments[0]
-    step = max(abs(segment.stretch - joint.start), LEAST_STEP)
+    start = joint.start(draft.begin)
+    step = max(abs(segment.stretch - start), LEAST_STEP)
     # A force of undetermined sign must not be made worse.
     doubted = estimate.doubted
     hidden = MUCH * step if not arrival and abs(
-        joint.start - planner.model.actuator.rest) < _FIRST and confounded(
+        start - planner.model.actuator.rest) < _FIRST and confounded(
             doubted, _HIDDEN * step) else 0.0
     # So must levels that are late by chance, whose vibration may come on top.
     levels = (planner.plan.level(draft.begin - 1), *draft.levels)
