@@ -27,7 +27,6 @@ from hmsa_lab.adapt.learnt import (
 )
 from hmsa_lab.adapt.messages import differences, sentence
 from hmsa_lab.adapt.motion import held, rest
-from hmsa_lab.adapt.move_errors import MoveErrors, Moves
 from hmsa_lab.adapt.prior import Prior
 from hmsa_lab.adapt.trust import Trust
 from hmsa_ros.runtime.records import Settings
@@ -80,8 +79,6 @@ class AdaptiveJoint:
     prior: Prior = field(init=False)  # of the given parameters
     estimator: Estimator = field(init=False)
     trust: Trust = field(init=False)
-    ledger: MoveErrors = field(default_factory=MoveErrors)
-    moves: Moves = field(default_factory=Moves)  # those of the plan in force
     latest: StateEstimate | None = None
     newest: int = 0  # time of the newest sample
     next_sample: int = 0  # time from which another sample is useful
@@ -95,7 +92,6 @@ class AdaptiveJoint:
     waits: int = 0  # arrival of a move slowed down to be corrected
     next_path: int = 0  # when to check a path again
     planning: int = 0  # how long planning a path took
-    after: float = 0.0  # predicted error of a drafted correction
     amplitude: float = 0.0  # largest vibration since the last arrival
     fresh: bool = False  # whether there are unprocessed samples
     looking: Iterator[None] | None = None  # the update under way
@@ -433,11 +429,11 @@ class AdaptiveJoint:
         confirmed = self.trust.confirmed
         return confirmed is not None and not same_parameters(confirmed, self.given)
 
-    def confirm(self, model: JointModel) -> None:
-        """Record that a move planned with a model has arrived."""
+    def confirm(self, model: JointModel, left: float) -> None:
+        """Record the error of a move planned with a model, as a fraction of its step."""
         if self.sensor_changed:
             return
-        self.trust.confirm(self.based(model), self.ledger.left)
+        self.trust.confirm(self.based(model), left)
         found = self.acting
         if found is not None and not self.trust.failed:
             place = found.free.index('stretch_bias')
@@ -486,9 +482,7 @@ class AdaptiveJoint:
 
     def foreseen(self, time: int) -> StateEstimate | None:
         """Return the state for slowing down moves; a cautious joint has one before any sample."""
-        if self.latest is not None or math.isinf(self.tolerance):
-            return self.state(time)
-        return self.predicted(time)
+        return self.predicted(time) if self.latest is None else self.state(time)
 
     @property
     def without(self) -> JointModel:

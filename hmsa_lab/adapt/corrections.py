@@ -31,7 +31,6 @@ from hmsa_lab.adapt.expected_error import (
 from hmsa_lab.adapt.learnt import as_of_path, initial_state, learnt_model, same_parameters
 from hmsa_lab.adapt.messages import confounded
 from hmsa_lab.adapt.motion import rest
-from hmsa_lab.adapt.move_errors import Moves
 from hmsa_ros.runtime.planning_task import PlanningTask, Replanning, replanning
 from hmsa_ros.runtime.records import Clock, Severity, Verdict
 
@@ -85,26 +84,23 @@ class Corrections:
 
     def _slowly(self, joint: AdaptiveJoint, draft: Draft) -> Draft:
         segment, *rest = draft.segments
-        estimate = joint.foreseen(draft.begin)
-        joint.moves = Moves(not same_parameters(
-            joint.based(draft.levels[-1].model), joint.given), joint.doubted)
         joint.next_update = joint.next_sample = joint.waits = 0
         self._feedback.wait_for(joint, segment)
         # An amplifier that saturated may not do so any more.
         joint.largest = math.inf
-        if estimate is None or segment.arrival is None or segment.code in (
+        if math.isinf(joint.tolerance) or segment.arrival is None or segment.code in (
                 Code.LEVELS, Code.PATH):
             return draft
-        step = max(abs(segment.stretch - draft.levels[0].stretch), LEAST_STEP)
-        course = _drafted(draft, joint.planner.plan)
-        slew = joint.planner.options.slew_limit
-        joint.moves.expected = expect(estimate, course, slew).size
-        duration = segment.arrival - segment.begin
-        if math.isinf(joint.tolerance) or duration < _REACHED * joint.planner.options.lead_time:
+        estimate = joint.foreseen(draft.begin)
+        if estimate is None:
             return draft
+        step = max(abs(segment.stretch - draft.levels[0].stretch), LEAST_STEP)
+        duration = segment.arrival - segment.begin
         # Parameters that are only suspected do not justify slowing down.
         named = len(joint.settings.feedback_parameters)
-        if expect(estimate.sure_of(named), course, slew).size <= joint.tolerance * step:
+        if duration < _REACHED * joint.planner.options.lead_time or expect(
+                estimate.sure_of(named), _drafted(draft, joint.planner.plan),
+                joint.planner.options.slew_limit).size <= joint.tolerance * step:
             return draft
         longer = caution(named, estimate.noise / step)
         arrival = segment.begin + round(longer * duration)
@@ -166,7 +162,6 @@ class Corrections:
                              for x in (planner.plan.levels, draft.levels))
             if _saturates(joint, draft) or not _nearer(joint, before, after, estimate):
                 return None
-            joint.after = after.size
             return draft
 
         return Replanning(lambda plan: plan.draft_path_anew(begin, model, state), adopt)
@@ -183,16 +178,12 @@ class Corrections:
         words = joint.words(self._clock())
         place, segments = draft.resumed, joint.planner.plan.segments
         self._feedback.corrections += 1
+        joint.planner.take(draft, now)
         if place and draft.begin == segments[place].since:
-            joint.planner.take(draft, now)
-            joint.moves.planned_anew = draft.begin
             return Verdict(Severity.OK, Code.CORRECTED, (
                 f'setpoints from {place + 1} of {len(segments)} on planned anew with the '
                 f'estimate: {words}'))
-        joint.planner.take(draft, now)
         joint.next_sample = 0
-        joint.moves.corrected.append(draft.begin)
-        joint.moves.expected, joint.after = joint.after, 0.0
         if draft.segments[0].path is not None:
             # A stop of the path uses its corrected model too.
             joint.used = joint.based(draft.levels[0].model)
@@ -304,7 +295,6 @@ def _gains(joint: AdaptiveJoint, arrival: int, draft: Draft | None) -> Draft | N
         after = expect(each, _drafted(draft, planner.plan), slew)
         if not worthwhile(before, after, max(gain, least, uneven)):
             return None
-    joint.after = after.size
     return draft
 
 

@@ -15,6 +15,7 @@ from hmsa_lab.adapt.adaptive_joint import AdaptiveJoint, RESTING
 from hmsa_lab.adapt.corrections import Corrections
 from hmsa_lab.adapt.learnt import same_parameters, save
 from hmsa_lab.adapt.messages import differences
+from hmsa_lab.adapt.move_errors import error_of
 from hmsa_ros.runtime.follower import Follower
 from hmsa_ros.runtime.planning_task import Drafts, PlanningTask
 from hmsa_ros.runtime.records import (
@@ -287,10 +288,13 @@ class Feedback(Follower):
             # With a failing sensor or another field, nothing can be concluded about the move.
             return
         plan = joint.planner.plan
-        why = yield from joint.ledger.take(
-            hold, plan, joint.without, joint.moves, joint.sensor)
+        model = plan.levels[-1].model
+        # Parameters as given cannot have made a move worse, whatever the temperature is by now.
+        given = joint.without if joint.adapted(joint.based(model)) else (
+            joint.given.at_temperature(model.temperature))
+        left, why = yield from error_of(hold, plan, given, joint.sensor)
         if not why:
-            joint.confirm(plan.levels[-1].model)
+            joint.confirm(model, left)
             return
         joint.trust.end(why)
         joint.news, joint.fresh = True, True
