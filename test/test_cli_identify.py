@@ -215,6 +215,13 @@ def test_samples_of_a_sensor_that_lost_the_actuator_are_refused_until_they_are_m
     assert identify(capsys, 'camera.csv', '--commands', 'levels.csv')[0] == 0
 
 
+def test_a_sensor_that_counts_the_other_way_is_named_as_the_reason(folder, capsys):
+    write('camera.csv', 'time,stretch', zip(TIMES, 2.0 - STRETCH, strict=True))
+    status, _, err = identify(capsys, 'camera.csv', '--commands', 'levels.csv')
+    assert status == 1
+    assert 'the stretch falls where the flux density rises: change the sign of the levels' in err
+
+
 def test_a_length_at_rest_in_another_unit_is_refused_with_what_was_taken(folder, capsys):
     write('camera.csv', 'time,length [mm]', zip(TIMES, 20.0 * STRETCH, strict=True))
     status, _, err = identify(

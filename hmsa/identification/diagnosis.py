@@ -18,6 +18,7 @@ from hmsa.identification import quantities
 from hmsa.identification.defects import GAIN, USUAL_GAIN
 from hmsa.identification.fit import autocorrelation, Fit, Whiteness, whiteness
 from hmsa.identification.initial_guess import segments
+from hmsa.identification.measurement import Measurement
 from hmsa.identification.result import Defect
 from hmsa.model import equations
 from hmsa.model.equations import Array
@@ -60,6 +61,8 @@ TOLERATED, _LEFT, LEFT_AT_3, _OF_SHAPED = 0.15, 1.7, 0.3, 2.0
 SHAPED, _ROUGHLY_SHAPED = 0.15, 0.35
 # Fraction of these residuals above which another departure explains them.
 _MOSTLY = 0.3
+# Correlation of position and level below which one of them has the wrong sign.
+_OPPOSED = -0.5
 # Wide ranges for soft actuators, in SI units, and the power of the time unit in each.
 _USUAL = {'shear_modulus': (100.0, 1e8, -2), 'density': (100.0, 2e4, 2),
           'time_unit': (1e-6, 1.0, 1), 'remanence': (3e-4, 3.0, -2)}
@@ -376,6 +379,16 @@ def check_plausible(fit: Fit, unknown: Collection[str]) -> None:
             f'the actuator in --params-file{hint}')
 
 
+def _opposed(recording: Measurement) -> str:
+    """Return what to do if the position falls where the level rises; empty if it does not."""
+    levels = recording.levels[recording.place(recording.time)]
+    if np.ptp(levels) == 0.0 or np.corrcoef(levels, recording.stretch)[0, 1] > _OPPOSED:
+        return ''
+    return (
+        f'; the {recording.coordinate.name} falls where the flux density rises: change the sign '
+        'of the levels, or the direction in which the sensor counts')
+
+
 def misfit(
         fit: Fit, found: Whiteness, marks: Sequence[Defect], alike: Repeated | None) -> str:
     """Return why the model is rejected, with numbers; empty if it is not."""
@@ -396,7 +409,8 @@ def misfit(
         return (
             f'the model cannot reproduce the recorded motion: {figures}, against a motion of '
             f'{motion:.3g} rms; check that times are in s and levels in tesla, of one clock and '
-            f'one run, and that --params-file describes the actuator{_remedy(seen) or _LOOK}')
+            'one run, and that --params-file describes the actuator'
+            f'{_opposed(fit.recording) or _remedy(seen) or _LOOK}')
     if fit.scale < _NUMERICAL:
         return ''
     if seen:
