@@ -237,12 +237,24 @@ def test_close_modes_that_change_with_the_stretch_are_no_single_one_of_more_damp
     assert [x.share[0] for x in found.modes] == pytest.approx([0.12, 0.12], rel=0.15)
 
 
-def test_what_was_not_asked_for_is_not_free_where_the_modes_hide_it(monkeypatch):
+@pytest.mark.parametrize('shares', [0.0, 0.95])
+def test_what_was_not_asked_for_is_not_free_where_the_modes_hide_it(monkeypatch, shares):
     # As on finite elements of a flat block, where each coordinate improves the fit.
     monkeypatch.setattr(modal, '_completed', lambda best, _: best)
+
+    def again(recording, values, free, **given):
+        # Without it, a cube's modes may only fit with impossible shares.
+        own = {SECONDARY[0][1]: shares} if shares and 'transverse_mass_factor' not in free else {}
+        return fit(recording, {**values, **own}, [x for x in free if x not in own], **given)
+
+    monkeypatch.setattr(sys.modules['hmsa.identification.identify'], 'fit', again)
     flat = replace(BLOCK, half_thickness=0.02 * BLOCK.half_length, damping_coefficient=5.0)
     found = identify(recorded(replace(flat, mass_factor=1.4, modes=Modes(
         (1.3,), (0.2,), (0.05,))), count=2), WITH_MODES, actuator=flat)
+    assert 0.0 < found.actuator.modes.shares[0] < 0.9
+    if shares:
+        assert found.verdict == 'not_identifiable'
+        return
     assert found.verdict == 'identified', found.reason
     assert 'transverse_mass_factor' not in found.names
     assert found.values['transverse_mass_factor'] == 1.0

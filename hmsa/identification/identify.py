@@ -32,6 +32,7 @@ from hmsa.identification.modal import (
     lines_of,
     modes_in,
     narrower,
+    possible,
     rescaled,
     stiffens,
     with_modes,
@@ -195,7 +196,7 @@ def _with_modes(
         less = fit(
             _keeping(best.recording, limit) if 'chain_limit' in hidden else best.recording,
             {**best.values, **hidden}, tuple(x for x in best.free if x not in hidden))
-        if less is None:
+        if less is None or not possible(less):
             break
         best, found = less, concluded(less)
     return found

@@ -365,18 +365,19 @@ def with_modes(
         wanted = (*wide, *names[:2 if viscous else 3])
         trials = [y for x in rows if (y := fit(
             recording, {**values, **dict(zip(names, x, strict=False))}, wanted,
-            most=_FEW)) is not None and _possible(y)]
+            most=_FEW)) is not None and possible(y)]
         if not trials:
             break
         found = min(trials, key=lambda x: loss(x.residual, best.scale))
         found = fit(recording, found.values, wanted, most=_FULL) or found
         found = _viscous(found) if viscous else found
-        if not (_possible(found) and _better(best, found, _PART_VISCOUS if viscous else _PART)):
+        if not (possible(found) and _better(best, found, _PART_VISCOUS if viscous else _PART)):
             break
         best, wide, values = found, found.free, found.values
         freed = fit(recording, values, (*wide, *(x[2] for x in SECONDARY[:i + 1])),
                     most=_FULL) if viscous else None
-        if freed is not None and whiteness(freed.root * freed.residual).white:
+        if freed is not None and possible(freed) and whiteness(
+                freed.root * freed.residual).white:
             # Modes with dampings of their own explain all but noise; so may further ones.
             best, wide, values, viscous = freed, freed.free, freed.values, False
     return _completed(best, free) if quantities.modes_of(best.values) else best
@@ -425,12 +426,12 @@ def _completed(best: Fit, free: Sequence[str]) -> Fit:
     recording = best.recording
     if 'chain_limit' in free and 'chain_limit' not in best.free:
         found = fit(recording, best.values, (*best.free, 'chain_limit'), most=_FULL)
-        if found is not None and _possible(found):
+        if found is not None and possible(found):
             best = found
     for name in [x for x in BESIDES if x in best.free and x not in free]:
         values = {**best.values, name: BESIDES[name][0]}
         less = fit(recording, values, tuple(x for x in best.free if x != name), most=_FULL)
-        if less is not None and _possible(less) and _gain(less, best)[0] < _CHI_SQUARED:
+        if less is not None and possible(less) and _gain(less, best)[0] < _CHI_SQUARED:
             best = less
     return best if best.converged else fit(recording, best.values, best.free) or best
 
@@ -448,7 +449,7 @@ def _lowest(values: Mapping[str, Any]) -> float:
     return _OF_BEAMS if law is not None and law.family in BEAMS else 1.0
 
 
-def _possible(found: Fit) -> bool:
+def possible(found: Fit) -> bool:
     """Return whether the modes of a fit are those of an actuator."""
     values = found.values
     modes = quantities.modes_of(values)
