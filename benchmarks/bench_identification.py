@@ -276,6 +276,7 @@ def speed(*, quick: bool = False) -> Sheet:
         'identification_speed',
         'Processor time to identify 2 s at 1 kHz',
         ['', 'least [ms]', 'median [ms]', 'apart [std]'], rows, figures, legend=[
-            '*This package*: start values, fit, diagnosis and intervals.',
+            '*This package*: start values, fit, diagnosis and intervals; of nine parameters, also '
+            'whether secondary modes would explain the samples as well as lag, force and creep.',
             '*SciPy*: the fit alone, of the same simulation, from values with errors of 10 %.',
             *shooting, '*Apart*: difference of the results in standard deviations.'])
