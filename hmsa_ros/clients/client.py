@@ -198,7 +198,20 @@ class PlannerClient(Link):
 
     def unheard(self) -> list[str]:
         """Return the command topics without subscribers other than recorders."""
-        return unheard(self.node, self._namespace, self._joints)
+        leave_out = ros_entities.recorders(self.node)
+        return [x for x in self._commands() if leave_out.issuperset(
+            ros_entities.subscribers_of(self.node, x).values())]
+
+    def _commands(self) -> list[str]:
+        """Return the topics on which the planner commands joints, including remapped ones."""
+        named = [
+            topic for topic, types in self.node.get_topic_names_and_types()
+            if topics.FLUX_DENSITY_COMMAND.type in types and self._planner in (
+                ros_entities.publishers_of(self.node, topic).values())]
+        return [x for x in named if x.split('/')[-2] in self._joints] or named or [
+            self.node.resolve_topic_name(
+                topics.of_joint(topics.FLUX_DENSITY_COMMAND, x, self._joints).name)
+            for x in self._joints]
 
     def send_sequence(
             self, setpoints: Sequence[tuple[float | Sequence[float], float]],
@@ -417,22 +430,3 @@ def _slower_time(node: Node, timeout: float) -> Iterator[Callable[[], float]]:
         yield time
     finally:
         clock.destroy()
-
-
-def unheard(node: Node, namespace: str, joints: Sequence[str]) -> list[str]:
-    """Return a planner's command topics without subscribers other than recorders."""
-    leave_out = ros_entities.recorders(node)
-    return [x for x in _commands(node, namespace, joints)
-            if leave_out.issuperset(ros_entities.subscribers_of(node, x).values())]
-
-
-def _commands(node: Node, namespace: str, joints: Sequence[str]) -> list[str]:
-    """Return the topics on which the planner commands joints, including remapped ones."""
-    planner = ros_entities.full_name(topics.PLANNER, namespace)
-    named = [
-        topic for topic, types in node.get_topic_names_and_types()
-        if topics.FLUX_DENSITY_COMMAND.type in types
-        and planner in ros_entities.publishers_of(node, topic).values()]
-    return [x for x in named if x.split('/')[-2] in joints] or named or [
-        node.resolve_topic_name(
-            topics.of_joint(topics.FLUX_DENSITY_COMMAND, x, joints).name) for x in joints]

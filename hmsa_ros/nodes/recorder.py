@@ -266,7 +266,7 @@ class Recorder(ManagedNode):
     def configure(self) -> None:
         """Open the bag and start receiving."""
         values = self._parameters_in
-        selection = Selection.of(values, self._full_name)
+        selection = Selection.of(values, self.resolve_topic_name)
         # While inactive, it is paused anyway.
         self._paused: bool = values['record.start_paused']
         self._sim_time = SimulatedTime() if self.simulated else None
@@ -315,11 +315,6 @@ class Recorder(ManagedNode):
         """Whether incoming messages are not recorded."""
         return self._paused or not self.active
 
-    def _full_name(self, name: str) -> str:
-        """Return the full, remapped name of a topic or node."""
-        resolved: str = self.resolve_topic_name(name)
-        return resolved
-
     def _on_poll(self) -> None:
         """Look for new topics, new publishers, and parameters of the experiment's nodes."""
         if self._capture.error is not None:
@@ -342,7 +337,7 @@ class Recorder(ManagedNode):
         """Find nodes whose parameters are to be stored."""
         wanted = self._parameters_in['experiment.nodes']
         bare = {name for name in wanted if '/' not in name}
-        full = {self._full_name(name) for name in wanted if '/' in name}
+        full = {self.resolve_topic_name(name) for name in wanted if '/' in name}
         # Identified by their services: node names are published on a separate topic, where
         # simultaneous messages may get lost (ros2/rmw_fastrtps#792).
         for service, _ in self.get_service_names_and_types():
@@ -356,8 +351,7 @@ class Recorder(ManagedNode):
         """Add timestamps to received messages, count them and pass them on."""
         taken = self._follow_wall(taken) if self._sim_time is None else self._follow(
             self._sim_time, taken)
-        for key, messages in taken:
-            self._take_in(key, messages)
+        self._take_in(taken)
 
     def _follow_wall(
             self, taken: Sequence[tuple[Any, list[Taken]]]) -> list[tuple[Any, list[Taken]]]:
@@ -366,8 +360,7 @@ class Recorder(ManagedNode):
         if by >= 0:
             return [*taken]
         earlier, rest = _parted(taken, partial(lt, now))
-        for key, messages in earlier:
-            self._take_in(key, messages)
+        self._take_in(earlier)
         for topic in list(self._recorded.topics.values()):
             topic.begin_anew()
         # Within a file, log times rise.
@@ -404,8 +397,7 @@ class Recorder(ManagedNode):
                 else:
                     rest.append((key, messages))
             earlier, rest = _parted(rest, partial(gt, message.received_ns))
-            for key, messages in earlier:
-                self._take_in(key, messages)
+            self._take_in(earlier)
             # A simulation restarted, or a bag is played in a loop.
             self.get_logger().warning(
                 f'simulated time jumped back from {before * 1e-9:.3f} s to {now * 1e-9:.3f} s: '
@@ -414,12 +406,13 @@ class Recorder(ManagedNode):
             self._note({'time_jumps': str(clock.jumps)})
         return rest
 
-    def _take_in(self, topic: RecordedTopic, messages: list[Taken]) -> None:
+    def _take_in(self, taken: Iterable[tuple[RecordedTopic, list[Taken]]]) -> None:
         """Count gaps, and pass the messages to the writer."""
-        batch, size = topic.take(
-            messages, None if self._sim_time is None else self._sim_time.at, paused=self._pausing)
-        if batch:
-            self._recording.put(batch, size)
+        at = None if self._sim_time is None else self._sim_time.at
+        for topic, messages in taken:
+            batch, size = topic.take(messages, at, paused=self._pausing)
+            if batch:
+                self._recording.put(batch, size)
 
     def _note(self, values: Mapping[str, str]) -> None:
         """Store information about the experiment."""
