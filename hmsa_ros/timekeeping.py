@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial
+import math
 import time
 
 from hmsa.model.units import NANOSECONDS
@@ -70,13 +71,10 @@ class RealTimeFactor:
         self._steady: int | None = None
         self.paused = paused
 
-    @property
-    def unlimited(self) -> bool:
-        """Whether the simulation runs as fast as possible."""
-        return self.factor == 0.0
-
-    def target(self, steady: int) -> int:
-        """Return the simulated time in ns due at a steady time; meaningless if `unlimited`."""
+    def target(self, steady: int) -> float:
+        """Return the simulated time in ns due at a steady time; infinite for a factor of 0."""
+        if self.factor == 0.0:
+            return math.inf
         if self.paused or self._steady is None:
             self._steady = steady
             return self._anchor

@@ -20,6 +20,8 @@ from hmsa_ros.runtime.records import Trajectory
 
 # Length of the preamble: the representation identifier and two bytes of options.
 _PREAMBLE = 4
+# Limit on the number of joints, above that of any planner.
+_MOST_JOINTS = 1000
 _LITTLE = b'\x00\x01'
 _BIG = b'\x00\x00'
 
@@ -71,6 +73,13 @@ class CdrReader:
         place = self._pass(length)
         return bytes(self._data[place:place + length]).rstrip(b'\0').decode('utf-8', 'replace')
 
+    def names(self, what: str) -> tuple[str, ...]:
+        """Return the names of joints; raise `BadInputError` if there are too many."""
+        many = self.count()
+        if many > _MOST_JOINTS:
+            raise BadInputError(f'{what} names {many} joints: expected at most {_MOST_JOINTS}')
+        return tuple(self.text() for _ in range(many))
+
 
 def stamp_of(data: bytes) -> int:
     """Return the timestamp in ns of a serialized message that begins with a header, else 0."""
@@ -106,11 +115,7 @@ class JointStateReader:
             reader.place = self._end - _PREAMBLE
         else:
             reader.text()
-            many = reader.count()
-            if many > _MOST_JOINTS:
-                raise BadInputError(
-                    f'a sample names {many} joints: expected at most {_MOST_JOINTS}')
-            self._names = tuple(reader.text() for _ in range(many))
+            self._names = reader.names('a sample')
             self._order, self._end = data[:2], reader.place + _PREAMBLE
             self._head = data[_PREAMBLE + 8:self._end]
         many = len(self._names)
@@ -121,8 +126,6 @@ class JointStateReader:
 
 # Minimum size of a point: four lengths and a duration.
 _LEAST_POINT = 24
-# Limit on the number of joints, above that of any planner.
-_MOST_JOINTS = 1000
 _FIELDS = ('positions', 'velocities', 'accelerations', 'effort')
 # Required fields of the points, and the message about unexpected values in the others.
 _WANTED = {
@@ -148,11 +151,8 @@ def read_trajectory(data: bytes) -> Trajectory:
     """
     cursor = CdrReader(data)
     stamp, name = cursor.time(), cursor.text()
-    many = cursor.count()
-    if many > _MOST_JOINTS:
-        raise BadInputError(
-            f'the trajectory names {many} joints: expected at most {_MOST_JOINTS}')
-    names = tuple(cursor.text() for _ in range(many))
+    names = cursor.names('the trajectory')
+    many = len(names)
     count = cursor.count()
     if _LEAST_POINT * count > cursor.left + 4:
         raise BadInputError('the message cannot be decoded: it ends too early')

@@ -277,7 +277,7 @@ class PlantNode(DeviceNode):
             if steady - self._clock_published >= _PAUSED_CLOCK_NS:
                 self._publish_clock(steady)
             return
-        self._run(math.inf if self._pacer.unlimited else self._pacer.target(steady))
+        self._run(self._pacer.target(steady))
 
     def _follow(self) -> None:
         """Advance to the node's clock: the wall clock, or a /clock of another node."""

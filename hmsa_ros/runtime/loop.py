@@ -6,51 +6,16 @@ the time, the applied levels, the cut-offs and the samples.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Protocol
 
-from hmsa.model.sensor import Sample
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.group import PlannerGroup
+from hmsa_ros.device.simulated import SimulatedDevice
+from hmsa_ros.device.watchdog import GuardedJoint
 from hmsa_ros.runtime.records import Environment, Output, Send, Settings
 from hmsa_ros.runtime.runtime import Runtime
 
 # Time to wait, in ns, while the controller waits for something.
 _PATIENCE = NANOSECONDS // 1000
-
-
-class LoopDevice(Protocol):
-    """A device that carries out commands; times in ns, fields in T, joints by number."""
-
-    @property
-    def time(self) -> int:
-        """Time that the device has been advanced to."""
-
-    @property
-    def next_sample(self) -> int:
-        """Time of the next sample."""
-
-    def receive(self, joint: int, stamp: int, level: float) -> None:
-        """Accept a level that applies from a timestamp."""
-
-    def advance(self, time: int) -> None:
-        """Simulate until a time."""
-
-    def changes(self) -> Sequence[tuple[int, int, float]]:
-        """Return the levels that took effect: joint, timestamp and level."""
-
-    def samples(self) -> Sequence[Sample]:
-        """Return the samples since the last call."""
-
-
-class LoopGuard(Protocol):
-    """Guard of a joint of a device, which rejects commands after a cut-off."""
-
-    number: int  #: of the joint
-    cut_off_time: int  #: time in ns that names the cut-off in force; 0 for none
-
-    @property
-    def is_cut_off(self) -> bool:
-        """Whether levels are rejected until a cut-off is acknowledged."""
 
 
 class Loop:
@@ -65,14 +30,14 @@ class Loop:
         Settings of the controller.
     device : SimulatedDevice
         The device to command; its time is that of the loop.
-    guards : sequence of LoopGuard, optional
+    guards : sequence of GuardedJoint, optional
         The guards of its joints, if it rejects commands after a cut-off.
 
     """
 
     def __init__(
-            self, group: PlannerGroup, settings: Settings, device: LoopDevice,
-            guards: Sequence[LoopGuard] = ()) -> None:
+            self, group: PlannerGroup, settings: Settings, device: SimulatedDevice,
+            guards: Sequence[GuardedJoint] = ()) -> None:
         self.now = device.time  #: in ns
         self.device, self._guards = device, guards
         self.runtime = Runtime(
