@@ -29,7 +29,7 @@ from hmsa.planning.shapers.request import MoveRequest
 from hmsa.planning.shapers.two_step import two_step
 from hmsa.report import looks, style
 from hmsa.report.looks import Paper
-from hmsa_studies.residual import Actual, ringing
+from hmsa_studies.robustness import Actual, ringing
 
 # Smaller fractions of a step are rounding of the search on a grid.
 _RESOLVED = 1e-8

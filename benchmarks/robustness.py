@@ -27,8 +27,16 @@ from hmsa.planning.shapers.request import MoveRequest, SmoothLimits
 from hmsa.report.looks import SCREEN
 from hmsa.table import percent
 from hmsa_studies.pictures import draw_front, draw_robustness
-from hmsa_studies.residual import Actual, Errors
-from hmsa_studies.robustness import Candidate, candidates, Case, PARAMETERS, Result, study
+from hmsa_studies.robustness import (
+    Actual,
+    Candidate,
+    candidates,
+    Case,
+    Errors,
+    PARAMETERS,
+    Result,
+    study,
+)
 from hmsa_studies.sweep import parse_grid, Sweep
 from hmsa_studies.sweep_pictures import draw_sweep
 

@@ -31,9 +31,8 @@ from hmsa.interfaces.parameters import LAW, LAW_NAME, ParameterSpec, PLANNED
 from hmsa.model.delivery import Delivery
 from hmsa.model.equations import Array
 from hmsa.model.laws import LAWS
-from hmsa.model.mismatch import Errors, Uncertainty
 from hmsa.model.moves import Limits
-from hmsa.model.parameters import NondimensionalParameters
+from hmsa.model.parameters import Errors, NondimensionalParameters, Uncertainty
 from hmsa.model.units import NANOSECONDS, Units
 from hmsa.planning.shapers.request import ERRORS
 

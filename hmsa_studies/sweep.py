@@ -39,7 +39,7 @@ from hmsa_studies.axes import (
     System,
     View,
 )
-from hmsa_studies.residual import Actual, arrival_of
+from hmsa_studies.robustness import Actual, arrival_of
 from hmsa_studies.study_folder import LEAST_ROWS, MOST_ROWS
 
 #: All codes; plans contain their indices.

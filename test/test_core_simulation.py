@@ -10,10 +10,10 @@ import pytest
 from scipy.integrate import solve_ivp, trapezoid
 
 from hmsa.errors import BadInputError, HmsaError
+from hmsa.model.delivery import CommandSchedule
 from hmsa.model.equations import damping, elastic_force, energy, equilibrium_stretch, mass
 from hmsa.model.moves import Setpoint
 from hmsa.model.parameters import NondimensionalParameters, paper_actuator
-from hmsa.model.schedule import CommandSchedule
 from hmsa.model.simulation import ActuatorSimulation, longest_motion, simulate
 from hmsa.planning.sequence import plan_sequence
 

@@ -181,7 +181,7 @@ def test_open_loop_in_the_study_leaves_what_the_study_of_shapers_says():
     from hmsa.model.parameters import NondimensionalParameters
     from hmsa.planning.shapers import get_shaper
     from hmsa.planning.shapers.request import MoveRequest
-    from hmsa_studies.residual import Actual, Errors
+    from hmsa_studies.robustness import Actual, Errors
 
     material = NondimensionalParameters()
     move = get_shaper('two_step')(MoveRequest(State(1.0), 1.4, material))

@@ -14,9 +14,8 @@ from hmsa.cli import main
 from hmsa.errors import BadInputError
 from hmsa.model.delivery import Delivery, IDEAL
 from hmsa.model.equations import elastic_force
-from hmsa.model.mismatch import Ellipsoid, Errors
 from hmsa.model.moves import Limits, State
-from hmsa.model.parameters import NondimensionalParameters, paper_actuator
+from hmsa.model.parameters import Ellipsoid, Errors, NondimensionalParameters, paper_actuator
 from hmsa.model.status import Code
 from hmsa.planning.shapers import get_shaper
 from hmsa.planning.shapers.minimax import (

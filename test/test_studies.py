@@ -37,11 +37,13 @@ from hmsa.planning.two_step import plan_two_step
 from hmsa.table import percent
 from hmsa_studies.axes import MOST_VALUES, parse_grid, read_cases
 from hmsa_studies.pictures import draw_front, draw_robustness
-from hmsa_studies.residual import Actual, arrival_of, Errors
 from hmsa_studies.robustness import (
+    Actual,
+    arrival_of,
     Candidate,
     candidates,
     Case,
+    Errors,
     PARAMETERS,
     study,
     write_csv,

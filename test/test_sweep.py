@@ -30,7 +30,7 @@ from hmsa_studies.axes import (
     parse_values,
     Spread,
 )
-from hmsa_studies.residual import Actual, Errors
+from hmsa_studies.robustness import Actual, Errors
 from hmsa_studies.sweep import Sweep
 
 ACTUATOR = {

@@ -40,9 +40,8 @@ from hmsa.interfaces.parameters import (
 from hmsa.interfaces.topics import PLANNER
 from hmsa.model.delivery import IDEAL
 from hmsa.model.equations import Array, critical_zeta, elastic_force, equilibrium_stretch
-from hmsa.model.mismatch import Uncertainty
 from hmsa.model.moves import Setpoint, State
-from hmsa.model.parameters import ActuatorParameters
+from hmsa.model.parameters import ActuatorParameters, Uncertainty
 from hmsa.planning.sequence import plan_sequence
 from hmsa.planning.shapers import get_shaper
 from hmsa.planning.shapers.request import as_errors, ERRORS, MoveRequest, SmoothLimits

@@ -24,8 +24,7 @@ from hmsa.interfaces.actuator import actuator_from, parameters_of, thermal_from
 from hmsa.interfaces.parameters import BLOCK, number_of
 from hmsa.interfaces.topics import PLANNER, PLANT
 from hmsa.model.creep import CONSTANTS, Flow, FLOWS, MAXWELL
-from hmsa.model.mismatch import Ellipsoid, Uncertainty
-from hmsa.model.parameters import ActuatorParameters
+from hmsa.model.parameters import ActuatorParameters, Ellipsoid, Uncertainty
 from hmsa.planning.shapers.request import as_errors, LARGEST_ERROR
 from hmsa.runs.parameters import Entries, entries_of, values_of
 
@@ -40,7 +39,7 @@ _LISTS = dict(zip(
     zip(*map(tuple.__add__, quantities.BRANCHES, quantities.FLOWING), strict=True), strict=True))
 # Half a 95 % interval, or half an axis of the ellipsoid by dimension, in standard deviations.
 _HALF_95 = (0.0, 1.96, 2.448, 2.795, 3.080)
-# Parameters of the motion, in the order of `hmsa.model.mismatch.Errors`.
+# Parameters of the motion, in the order of `hmsa.model.parameters.Errors`.
 _MISMATCH = ('shear_modulus', 'damping_coefficient', 'chain_limit', 'remanence')
 _RANKS = {'': 1, PLANT: 2, PLANNER: 3}
 

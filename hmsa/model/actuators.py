@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from hmsa import motion
 from hmsa.errors import BadInputError, check_number
 from hmsa.model import law
+from hmsa.model.delivery import CommandSchedule
 from hmsa.model.equations import Array, stretch_limits
 from hmsa.model.parameters import ActuatorParameters, NondimensionalParameters
-from hmsa.model.schedule import CommandSchedule
 from hmsa.model.units import NANOSECONDS
 
 #: Relative tolerance of the integration.

@@ -19,11 +19,10 @@ from hmsa.errors import BadInputError, HmsaError
 from hmsa.model import law
 from hmsa.model.actuators import Actuators, RTOL, Setup
 from hmsa.model.creep import Creep, MAXWELL
-from hmsa.model.delivery import Delivery, IDEAL, Piece, ramps
+from hmsa.model.delivery import CommandSchedule, Delivery, IDEAL, Piece, ramps
 from hmsa.model.equations import acceleration, Array, elastic_force
 from hmsa.model.moves import Level, State
 from hmsa.model.parameters import ActuatorParameters, NondimensionalParameters
-from hmsa.model.schedule import CommandSchedule
 
 __all__ = [
     'ActuatorSimulation', 'follow', 'longest_motion', 'response', 'RTOL',

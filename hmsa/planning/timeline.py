@@ -19,9 +19,8 @@ from hmsa.errors import check_choice, check_number
 from hmsa.model import law
 from hmsa.model.delivery import Delivery, IDEAL
 from hmsa.model.equations import acceleration
-from hmsa.model.mismatch import Uncertainty
 from hmsa.model.moves import Level, Limits, State
-from hmsa.model.parameters import ActuatorParameters, NondimensionalParameters
+from hmsa.model.parameters import ActuatorParameters, NondimensionalParameters, Uncertainty
 from hmsa.model.simulation import follow, longest_motion, observed, sampled
 from hmsa.model.status import Code
 from hmsa.model.units import NANOSECONDS, Units

@@ -23,7 +23,7 @@ from hmsa.errors import assume, BadInputError, BagError, meant, MissingWarning
 from hmsa.interfaces.diagnostics import newest, Outcome
 from hmsa.interfaces.parameters import JOINT
 from hmsa.judge.records import SensorModel
-from hmsa.model.schedule import is_axial_field
+from hmsa.model.delivery import is_axial_field
 from hmsa.model.thermal import COLDEST, HOTTEST
 from hmsa.model.units import NANOSECONDS
 from hmsa.runs import topics as roles

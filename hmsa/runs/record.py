@@ -23,10 +23,10 @@ from hmsa.interfaces.diagnostics import LEVELS, Outcome
 from hmsa.interfaces.parameters import LATENESS_LIMIT, number_of
 from hmsa.interfaces.topics import PLANT
 from hmsa.judge.records import RequestedSetpoint, SensorModel
+from hmsa.model.delivery import CommandSchedule, Superseding
 from hmsa.model.equations import Array, equilibrium_stretch, natural_frequency, stretch_limits
 from hmsa.model.law import critical_zeta
 from hmsa.model.parameters import ActuatorParameters, paper_actuator
-from hmsa.model.schedule import CommandSchedule, Superseding
 from hmsa.model.units import NANOSECONDS
 from hmsa.runs.parameters import of_joint
 from hmsa.runs.topics import APPLIED

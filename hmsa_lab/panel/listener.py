@@ -20,9 +20,9 @@ from hmsa.errors import BadInputError, printable
 from hmsa.files import finite
 from hmsa.interfaces import topics
 from hmsa.interfaces.diagnostics import real, StatusVerdict, texts, whole
+from hmsa.model.delivery import CommandSchedule
 from hmsa.model.equations import Array
 from hmsa.model.laws.record import COORDINATES, POSITION
-from hmsa.model.schedule import CommandSchedule
 from hmsa.model.units import flux_text, NANOSECONDS
 from hmsa_ros.nodes import ros_entities
 from hmsa_ros.nodes.capture import decode, RawSubscription, Taken

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import math
 
 from hmsa.errors import BadInputError, check_number
-from hmsa.model.schedule import CommandSchedule
+from hmsa.model.delivery import CommandSchedule
 from hmsa.model.units import NANOSECONDS
 from hmsa_ros.device.hardware import Calls, Hardware, HardwareError, Instrument
 from hmsa_ros.device.watchdog import Change, Fallback, GuardedJoint, Kind, Notice, StateLostError

@@ -13,7 +13,7 @@ from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from hmsa.errors import BadInputError
-from hmsa.model.schedule import is_axial_field
+from hmsa.model.delivery import is_axial_field
 from hmsa.model.units import NANOSECONDS
 
 if TYPE_CHECKING:

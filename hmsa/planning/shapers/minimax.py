@@ -23,8 +23,8 @@ from hmsa import motion
 from hmsa.model import law
 from hmsa.model.delivery import late, ramps
 from hmsa.model.equations import Array
-from hmsa.model.mismatch import Ellipsoid, Errors
 from hmsa.model.moves import Level, Move, State
+from hmsa.model.parameters import Ellipsoid, Errors
 from hmsa.model.simulation import branches_of, flow_rates, with_followed
 from hmsa.model.status import Code
 from hmsa.planning.shapers.creeping import arrival

@@ -13,9 +13,8 @@ from hmsa.errors import BadInputError, check_number, excerpt
 from hmsa.model import law
 from hmsa.model.delivery import Delivery, IDEAL
 from hmsa.model.equations import Array
-from hmsa.model.mismatch import Ellipsoid, Uncertainty
 from hmsa.model.moves import Level, Limits, Move, State
-from hmsa.model.parameters import NondimensionalParameters
+from hmsa.model.parameters import Ellipsoid, NondimensionalParameters, Uncertainty
 from hmsa.model.simulation import branches_of
 from hmsa.model.status import Code, RefusedError
 from hmsa.model.units import Units
