@@ -184,14 +184,11 @@ class SimulatedDevice(Device):
         for known, command in self._transit.arrived(time):
             self._integrate(known)
             self._obey(*command)
-        self._watch(time)
-        self._integrate(time)
-
-    def _watch(self, time: int) -> None:
-        """Command the safe flux up to a time in ns where a watchdog demands it."""
+        # The safe flux, where a watchdog demands it.
         for i, guard in enumerate(self.guards):
             for stamp, level in guard.watch(self.time, time, self.level(i)):
                 self._actuators.command(i, stamp, level)
+        self._integrate(time)
 
     def _integrate(self, time: int) -> None:
         """Advance all joints; those with an excessive load restart."""

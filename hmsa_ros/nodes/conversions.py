@@ -152,7 +152,7 @@ def to_planner_status(status: 'StatusChanged') -> DiagnosticStatus:
         found = status.findings.get(name)
         of_each = {**vars(of_joint), **({} if found is None else found.to_texts())}
         values |= {f'{prefix}{key}': value for key, value in of_each.items()}
-    values |= of_joints('coordinate', status.coordinates)
+    values |= coordinates(status.coordinates)
     severity, message = int(verdict.severity), verdict.message
     for key, trouble in (('unheard', status.unheard), ('unseen', status.unseen)):
         if trouble:
@@ -168,9 +168,10 @@ def to_outcome(outcome: 'Outcome') -> DiagnosticStatus:
         'planner: outcome', outcome.joint, int(not fine), outcome.message, outcome.to_texts())
 
 
-def of_joints(key: str, by_joint: Mapping[str, object]) -> dict[str, object]:
-    """Return values of joints by status key, which names the joint if there are several."""
-    return {f'{name}.{key}' if len(by_joint) > 1 else key: x for name, x in by_joint.items()}
+def coordinates(by_joint: Mapping[str, str]) -> dict[str, object]:
+    """Return the coordinates of joints by status key, which names one of several joints."""
+    several = len(by_joint) > 1
+    return {f'{name}.coordinate' if several else 'coordinate': x for name, x in by_joint.items()}
 
 
 def to_status(

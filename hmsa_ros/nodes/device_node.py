@@ -67,8 +67,7 @@ _RECEIPTS, _SIGNS_OF_LIFE = 20_000_000, 200_000_000
 
 def fallback_from(values: Mapping[str, Any]) -> Fallback:
     """Return the fallback described by the values of `FALLBACK`."""
-    return Fallback(*(
-        values[x] for x in ('command_timeout', 'safe_flux', 'safe_ramp_rate', 'lateness_limit')))
+    return Fallback(*(values[x.name] for x in FALLBACK))
 
 
 class DeviceJoint:

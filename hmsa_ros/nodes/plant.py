@@ -384,7 +384,7 @@ class PlantNode(DeviceNode):
 
     def _report(self) -> Iterable[DiagnosticStatus]:
         yield self._status_of_commands(
-            paused=self._pacer.paused, **conversions.of_joints('coordinate', dict(zip(
+            paused=self._pacer.paused, **conversions.coordinates(dict(zip(
                 (x.name for x in self._joints), self.device.coordinates, strict=True))))
         yield self._status_of_time()
 

@@ -89,14 +89,11 @@ class Deviations:
 
     def restart(self, *, levels: bool = False) -> None:
         """Discard the state of plans that are dropped, and all times; optionally keep levels."""
-        # Without a level, a cut-off could not be acknowledged until the next report.
-        kept = {x: (0, level) for x, (_, level) in self.newest.items()} if levels else {}
-        self.newest.clear()
-        self.newest.update(kept)
-        self._suspected.clear()
-        self._ages.clear()
-        self._sampled, self._received = _Newest(), _Newest()
-        self.dropped(list(self._group.planners))
+        if not levels:
+            # With levels, a cut-off can be acknowledged before the next report.
+            self.newest.clear()
+        for name in self._group.planners:
+            self.forget_times(name)
 
     def forget_times(self, joint: str) -> None:
         """Discard the times of a device whose clock was set, and keep its level."""

@@ -12,7 +12,7 @@ from hmsa.planning.group import PlannerGroup
 from hmsa.planning.timeline import JointModel
 from hmsa.plugins import FOLLOWER, registered
 from hmsa_ros.runtime.planning_task import Drafts, PlanningTask
-from hmsa_ros.runtime.records import Clock, Output, Samples, Settings, Verdict
+from hmsa_ros.runtime.records import Samples, Settings, Verdict
 
 _OFF = 'feedback is off, so there is no estimate: expected observe, adapt or cautious'
 
@@ -112,15 +112,13 @@ class Follower:
         raise BadInputError(_OFF)
 
 
-def feedback(
-        group: PlannerGroup, settings: Settings, outputs: list[Output], clock: Clock,
-        report_ended: Callable[[str], None], doing: Doing) -> Follower:
-    """Return feedback from samples; ``report_ended`` is told why that of a joint has ended."""
-    return import_feedback()(group, settings, outputs, clock, report_ended, doing)
-
-
 def import_feedback() -> Callable[..., Follower]:
-    """Return what makes feedback; importing it takes some tenths of a second."""
+    """
+    Return what makes feedback from samples; importing it takes some tenths of a second.
+
+    It takes the planners, settings, outputs, a clock, a function that is told why feedback of a
+    joint has ended, and what executes long-running work.
+    """
     import_module('multiprocessing.connection')  # for the processes that estimate
     make: Callable[..., Follower] = registered(FOLLOWER)['adapt'].load()
     return make

@@ -20,7 +20,7 @@ from hmsa.planning.timeline import JointModel
 from hmsa_ros.runtime.arrival_monitor import ArrivalMonitor
 from hmsa_ros.runtime.command_link import CommandLink
 from hmsa_ros.runtime.deviations import Deviations
-from hmsa_ros.runtime.follower import feedback, Follower, import_feedback
+from hmsa_ros.runtime.follower import Follower, import_feedback
 from hmsa_ros.runtime.receipts import Receipts
 from hmsa_ros.runtime.records import (
     by_joint,
@@ -126,7 +126,7 @@ class Runtime:
             self._importing.result()
             self._importing = None
         if self.settings.feedback != 'off' and self.follower.open_loop:
-            self.follower = feedback(
+            self.follower = import_feedback()(
                 self.group, self.settings, self._outputs, self._clock, self._report_ended,
                 self.follower.doing)
             self.planning.follower = self._watch.follower = self._takeover.follower = (
