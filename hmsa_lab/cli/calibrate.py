@@ -323,7 +323,7 @@ def _latency(arguments: argparse.Namespace) -> int:
             raise BadInputError(
                 '--lag is given with a probe, which measures it: expected one of both')
     from hmsa.identification.files import read_belief
-    from hmsa_lab.experiments.calibrating import measure_delays, steps_of
+    from hmsa_lab.bench.calibration import measure_delays, steps_of
 
     actuator = read_belief(arguments.params_file).actuator
     if arguments.params_file is None and not arguments.simulate:
@@ -376,8 +376,7 @@ def _static(arguments: argparse.Namespace) -> int:
     # A table needs six levels.
     paper, name = paper_of(arguments, *_files(arguments.out)), _checked(arguments, 3)
     check_number('--settle', arguments.settle, 's', least=0.1)
-    from hmsa_lab.bench.calibration import scale_at_rest, scale_by_gauge, statics
-    from hmsa_lab.experiments.calibrating import hold_staircase
+    from hmsa_lab.bench.calibration import hold_staircase, scale_at_rest, scale_by_gauge, statics
 
     gauge = None if arguments.gauge is None else _made(arguments.gauge, '--gauge')
     with _bench(name, arguments) as bench, progress() as update:
