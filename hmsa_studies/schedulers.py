@@ -91,7 +91,7 @@ def local(workers: int) -> Start:
 
 
 @contextmanager
-def cluster(address: str, workers: int | None = None) -> Iterator[Compute]:
+def cluster(address: str, workers: int | None) -> Iterator[Compute]:
     """Yield a function that computes on a Dask cluster, or raise `BadInputError`."""
     # An address is that of a scheduler, its file, or 'local' for a cluster on this machine.
     try:

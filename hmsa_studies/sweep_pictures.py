@@ -51,11 +51,10 @@ _DECADES = 30.0
 
 def draw_sweep(
         paths: Sequence[Path], view: View, columns: Mapping[str, Array],
-        fixed: Mapping[str, float] | None = None, paper: Paper | None = None) -> None:
+        fixed: Mapping[str, float], paper: Paper) -> None:
     """Draw a sweep's columns, NaN without a plan, with the constant columns as a title."""
     values = {name: _scale(name) * view.arranged(x) for name, x in columns.items()}
     rows = len(view.labels) if view.y else 1
-    paper = paper or Paper()
     # Stack the columns if the paper is too narrow.
     stacked = paper.columns(len(values)) < len(values)
     with style.picture(paths, 1.1 + 2.5 * rows * (len(values) if stacked else 1), paper) as figure:
@@ -79,7 +78,7 @@ def draw_sweep(
             if panel.get_label() != '<colorbar>' and (letter := next(letters, '')):
                 panel.set_title(f'({letter})', loc='left', fontweight='bold')
         _notes(figure, panels[0, 0], view, values)
-        common = [_with_value(x, _scale(x) * y) for x, y in (fixed or {}).items()]
+        common = [_with_value(x, _scale(x) * y) for x, y in fixed.items()]
         if common:
             figure.suptitle(', '.join(common))
 

@@ -141,7 +141,7 @@ class PlanStart:
 
 
 def check_points(
-        points: Sequence[tuple[float, int]], rest: float, check: Check = proceed) -> None:
+        points: Sequence[tuple[float, int]], rest: float, check: Check) -> None:
     """Check points (stretch, end in ns from the start); raise `RefusedError` if invalid."""
     for begin in range(0, max(len(points), 1), _CHECKED):
         part = points[begin:begin + _CHECKED]

@@ -275,7 +275,7 @@ class Takeover:
 
     def _is_over(
             self, name: str, seen: ObservedSample, settings: Settings, *,
-            outdated: bool = False) -> bool:
+            outdated: bool) -> bool:
         """Wait for a new sample; return True after a vain wait, or refuse to continue without."""
         steady = self._around.steady()
         if self._look_until is None:
