@@ -17,6 +17,8 @@ Doing = Callable[..., Awaited[Any]]
 
 #: Interval in ns at which results are polled.
 ANSWER = 5_000_000
+# Interval in ns at which waiting work looks whether a process is free.
+_LOOK = 500_000
 # The module that the work uses is imported before the first work.
 _WORKER = (
     'import sys; sys.path[:] = {!r}; import {}; '
@@ -80,6 +82,7 @@ class Offload:
         self._report, self._module = report, module
         self.count = max(min(count, len(os.sched_getaffinity(0))), 1)
         self._workers: list[_Process] = []
+        self._next_look = 0  # time from which to look again whether a process is free
         self._lost = False
 
     def __call__(self, work: Callable[..., T], *arguments: object) -> Awaited[T]:
@@ -88,11 +91,15 @@ class Offload:
         begun = monotonic_ns()
         try:
             while self._workers:
-                free = next((x for x in self._workers if not x.owes()), None)
-                if free is not None:
-                    result: T = yield from free.result(work, arguments)
-                    return result
-                if monotonic_ns() - begun > max(x.patience for x in self._workers):
+                now = monotonic_ns()
+                # Looking takes a system call for each process, and much work may wait.
+                if now >= self._next_look:
+                    free = next((x for x in self._workers if not x.owes()), None)
+                    if free is not None:
+                        result: T = yield from free.result(work, arguments)
+                        return result
+                    self._next_look = now + _LOOK
+                if now - begun > max(x.patience for x in self._workers):
                     raise TimeoutError
                 yield
         except (OSError, EOFError):
