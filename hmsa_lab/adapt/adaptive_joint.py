@@ -43,8 +43,9 @@ _UPDATE, _OFTEN, RESTING = 20_000_000, 0.45, 200_000_000
 # Factor of the interval while a joint rings, and the time scales after its last change of level
 # from which it rings, and from which it rests.
 _SELDOM, _RINGING, _QUIET = 4, 3.0, 24.0
-# Samples used per natural period, and the factor by which there are fewer at rest.
-_DENSE, _SPARSE = 40, 10
+# Samples used per natural period, of a joint among many, and the factor by which there are fewer
+# at rest.
+_DENSE, _CROWDED, _SPARSE = 40, 16, 10
 # Time scales between two choices of the parameters to plan with.
 _CHOICE = 3.0
 # Time scales after an arrival that show whether it succeeded.
@@ -76,6 +77,7 @@ class AdaptiveJoint:
     given: JointModel
     settings: Settings
     begun: InitVar[int]
+    crowded: bool  # whether it is one of many joints
     prior: Prior = field(init=False)  # of the given parameters
     estimator: Estimator = field(init=False)
     trust: Trust = field(init=False)
@@ -231,7 +233,8 @@ class AdaptiveJoint:
             self._take(*sample)
         else:
             self._waiting.append(sample)
-        cell = round(self.given.units.time * NANOSECONDS) * 2 // _DENSE
+        cell = round(self.given.units.time * NANOSECONDS) * 2 // (
+            _CROWDED if self.crowded else _DENSE)
         rests = self.latest and self._still(_QUIET * self.given.units.time)
         self.next_sample = self.newest + (cell * _SPARSE if rests else cell)
 

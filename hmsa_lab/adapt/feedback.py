@@ -99,7 +99,8 @@ class Feedback(Follower):
             joint.take_measured(self._clock())
         self.joints = {
             name: AdaptiveJoint(
-                name, self._group.planners[name], model, self._settings, self._clock())
+                name, self._group.planners[name], model, self._settings, self._clock(),
+                _SHARED * len(models) > _IDLE)
             for name, model in models.items()} if self.on else {}
 
     def change(self, settings: Settings, models: Mapping[str, JointModel]) -> Mapping[
@@ -188,7 +189,7 @@ class Feedback(Follower):
     def wait_for(self, joint: AdaptiveJoint, segment: PlannedSegment) -> None:
         """Update a joint among many only when samples show how it has arrived."""
         # Sooner, it changes no plan, and keeps an update of another joint waiting.
-        if _SHARED * len(self.joints) > _IDLE:
+        if joint.crowded:
             joint.next_update = max(joint.next_update, joint.shown_from(segment))
 
     def give_way(self, now: int) -> None:
