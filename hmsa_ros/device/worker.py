@@ -392,6 +392,8 @@ class HardwareWorker:
                 self._save(f'{self.device.calls.current or "the hardware"} does not return')
         if self._saver is not None:
             self._saver.join(3.0 * _PAST)
+            # A blocked call that returns after all may have written a level: off follows it.
+            self._thread.join(_PATIENCE)
 
     # -- in the thread of the hardware ---------------------------------------------------------
 
