@@ -35,6 +35,24 @@ from hmsa.planning.timeline import (
     Warmth,
 )
 
+#: Stretch, rate in 1/s and acceleration in 1/s^2; the acceleration is NaN if not given.
+PathPoint = tuple[float, float, float]
+
+# Fractions of the hardest braking to try, in this order, if that leads to no plan.
+_BRAKE_SHARES = (0.5, 0.1, 0.02, 0.0)
+# Natural periods by which to delay further attempts if resuming at once is impossible.
+_PATIENCE = (0.15, 0.3, 0.45, 0.6)
+# Deviation of the field from the holding load that counts as settled, as a fraction of the load.
+_SETTLED = 1e-6
+# Rates up to this, in 1/s, count as rest at the end of a path.
+_STOPPED = 1e-7
+# Duration of the return to a path, in natural periods; in a longer one, vibration swings farther
+# than without correction.
+_BACK = 0.4
+# Minimum tolerance of a corrected path, as a fraction of its range.
+_ANEW = 1e-4
+# Setpoints between two checks, in about 0.1 ms; levels take longer.
+_CHECKED = 200
 # Stretch rates below this fraction of the natural frequency are rounding errors.
 _AT_REST = 1e-6
 # Newton iterations for the braking load, and the tolerance of its duration, relative.
@@ -103,26 +121,6 @@ def holdable(model: JointModel, stretch: float) -> float:
     margin = _INSIDE * min(most - least, 1.0 + abs(nearest))
     return float(equilibrium_stretch(
         nearest + math.copysign(margin, nearest - load), model.material))
-
-
-#: Stretch, rate in 1/s and acceleration in 1/s^2; the acceleration is NaN if not given.
-PathPoint = tuple[float, float, float]
-
-# Fractions of the hardest braking to try, in this order, if that leads to no plan.
-_BRAKE_SHARES = (0.5, 0.1, 0.02, 0.0)
-# Natural periods by which to delay further attempts if resuming at once is impossible.
-_PATIENCE = (0.15, 0.3, 0.45, 0.6)
-# Deviation of the field from the holding load that counts as settled, as a fraction of the load.
-_SETTLED = 1e-6
-# Rates up to this, in 1/s, count as rest at the end of a path.
-_STOPPED = 1e-7
-# Duration of the return to a path, in natural periods; in a longer one, vibration swings farther
-# than without correction.
-_BACK = 0.4
-# Minimum tolerance of a corrected path, as a fraction of its range.
-_ANEW = 1e-4
-# Setpoints between two checks, in about 0.1 ms; levels take longer.
-_CHECKED = 200
 
 
 @dataclass(frozen=True)
