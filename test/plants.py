@@ -1,4 +1,4 @@
-"""An actuator that tells of the levels that take effect."""
+"""An actuator that reports the levels that take effect."""
 
 import math
 
