@@ -16,6 +16,7 @@ from rclpy.parameter import get_parameter_value, Parameter, parameter_value_to_p
 import yaml
 
 from hmsa import Actuator, plugins
+from hmsa.cli.options import _PLANNING
 from hmsa.errors import BadInputError
 from hmsa.interfaces.actuator import actuator_from
 from hmsa.interfaces.parameters import (
@@ -371,6 +372,12 @@ def test_unknown_name_is_refused_unless_another_node_has_it(make_ros, name, sugg
         return
     with pytest.raises(BadInputError, match=f'{name} does not exist.* {suggested or ""}'):
         check_names(node)
+
+
+def test_commands_without_ros_know_the_defaults_of_the_planner_for_how_to_plan():
+    defaults = {x.name: x.default for x in DECLARED['planner']}
+    for name, (_, *usual) in _PLANNING.items():
+        assert defaults[name] in usual, name
 
 
 def test_names_of_all_nodes_are_known_without_importing_them():
