@@ -46,7 +46,7 @@ _STOP = 0.1
 _LOOK = 24
 
 
-class Curve(NamedTuple):
+class StaticCharacteristic(NamedTuple):
     """Level in T against stretch."""
 
     level: PPoly  #: of degree 5, 0 at stretch 1
@@ -125,7 +125,7 @@ def _check(
 
 
 @lru_cache(maxsize=32)
-def fitted(stretch: tuple[float, ...], flux: tuple[float, ...]) -> Curve:
+def fitted(stretch: tuple[float, ...], flux: tuple[float, ...]) -> StaticCharacteristic:
     """
     Return the curve through points, which increases everywhere and is 0 at stretch 1.
 
@@ -173,7 +173,7 @@ def fitted(stretch: tuple[float, ...], flux: tuple[float, ...]) -> Curve:
             f'law table has a flux density of {offset:.4g} T at stretch 1: expected 0 within '
             f'{allowed:.2g} T; stretch is the length over the length at rest without field')
     level.c[-1] -= offset
-    return Curve(level, float(level(1.0, 1)), scatter * height)
+    return StaticCharacteristic(level, float(level(1.0, 1)), scatter * height)
 
 
 def _knots(u: Array) -> Array:

@@ -3,7 +3,7 @@ Hyperelastic models that are written once, as an energy in Python.
 
 The energy is a function of the `Strain` and of the constants, as numbers. It is called once, with
 terms in place of numbers, which record the operations. Their derivatives give the force. Both are
-programs that the compiled equation of motion runs over its scalars (``Formula`` in
+tapes that the compiled equation of motion runs over its scalars (``Formula`` in
 ``hmsa/motion/hmsa/law.hpp``), which provide the derivatives by the constants.
 """
 
@@ -24,7 +24,7 @@ from hmsa.model.laws.record import (
     positive_modulus,
 )
 
-# Operations of a program; the first is none. Two of them also have a form with a constant.
+# Operations of a tape; the first is none. Two of them also have a form with a constant.
 (_LEAF, _SUM, _SUM_FIXED, _PRODUCT, _PRODUCT_FIXED, _INVERSE, _DEFINED, _LOG, _LOG1P, _EXP,
  _EXPM1) = range(11)
 # Numbers that the motion provides: stretch along the field and across it, the inverse of the
@@ -39,7 +39,7 @@ _SMALL = 4
 Number = Union['Term', float]
 
 
-class _Program:
+class _Tape:
     """Operations on constants and given numbers, each one once."""
 
     def __init__(self, constants: int) -> None:
@@ -139,48 +139,48 @@ class _Program:
 
 @dataclass(frozen=True)
 class Term:
-    """A number that a program computes."""
+    """A number that a tape computes."""
 
-    program: _Program
+    tape: _Tape
     place: int
 
     @property
     def known(self) -> float | None:
         """Return its value if it is a literal."""
-        value = self.program.steps[self.place][1]
+        value = self.tape.steps[self.place][1]
         return value if self.rank == 0 else None
 
     @property
     def rank(self) -> int:
         """Return 0 for a literal, 1 for what depends on constants alone, 2 for what moves."""
-        return self.program.ranks[self.place]
+        return self.tape.ranks[self.place]
 
     def _with(self, operation: int, other: 'Term', neutral: float) -> 'Term':
         if neutral in (self.known, other.known):
             return other if self.known == neutral else self
         a, b = sorted((self, other), key=lambda x: (x.rank, x.place))
-        return self.program.term(operation, a.place, b.place)
+        return self.tape.term(operation, a.place, b.place)
 
     def factors(self) -> tuple[float, 'Term', 'Term']:
         """Return the literal, the constant and the moving factor."""
-        one = self.program.literal(1.0)
+        one = self.tape.literal(1.0)
         if self.known is not None:
             return self.known, one, one
-        operation, a, b = self.program.steps[self.place]
-        if operation == _PRODUCT and (first := Term(self.program, a)).rank < self.rank:
+        operation, a, b = self.tape.steps[self.place]
+        if operation == _PRODUCT and (first := Term(self.tape, a)).rank < self.rank:
             number, fixed, _ = first.factors()
-            rest = Term(self.program, b)
+            rest = Term(self.tape, b)
             return (number, fixed, rest) if self.rank == 2 else (number, rest, one)
         return (1.0, one, self) if self.rank == 2 else (1.0, self, one)
 
     def __add__(self, other: Number) -> 'Term':
         """Add."""
-        return self._with(_SUM, self.program.literal(other), 0.0)
+        return self._with(_SUM, self.tape.literal(other), 0.0)
 
     def __mul__(self, other: Number) -> 'Term':
         """Multiply, literals and constants first."""
-        (number, *mine), (by, *its) = self.factors(), self.program.literal(other).factors()
-        found = self.program.literal(number * by)
+        (number, *mine), (by, *its) = self.factors(), self.tape.literal(other).factors()
+        found = self.tape.literal(number * by)
         if number * by == 0.0:
             return found
         for x, y in zip(mine, its, strict=True):
@@ -212,7 +212,7 @@ class Term:
     def __pow__(self, exponent: Number) -> 'Term':
         """Raise to a power; to one that is not a whole number, of a positive base."""
         if exponent == 0:
-            return self.program.literal(1.0)
+            return self.tape.literal(1.0)
         if not isinstance(exponent, Term) and exponent == int(exponent) and (
                 abs(exponent) <= _SMALL):
             found = self if exponent > 0 else self._inverse()
@@ -220,7 +220,7 @@ class Term:
         return exp(exponent * log(self))
 
     def _inverse(self) -> 'Term':
-        return self.program.inverses.get(self) or self.program.term(_INVERSE, self.place)
+        return self.tape.inverses.get(self) or self.tape.term(_INVERSE, self.place)
 
 
 @dataclass(frozen=True)
@@ -240,31 +240,31 @@ class Strain:
 
 def log(x: Term) -> Term:
     """Return the natural logarithm; there is no energy where x is not positive."""
-    if x == x.program.across:
-        return -0.5 * log(x.program.along)
-    return x.program.term(_LOG, x.place)
+    if x == x.tape.across:
+        return -0.5 * log(x.tape.along)
+    return x.tape.term(_LOG, x.place)
 
 
 def log1p(x: Term) -> Term:
     """Return the logarithm of 1 + x; there is no energy where this is not positive."""
-    return x.program.term(_LOG1P, x.place)
+    return x.tape.term(_LOG1P, x.place)
 
 
 def exp(x: Term) -> Term:
     """Return the exponential, as a power of one of the same term if there is one."""
     if x.known is not None:
-        return x.program.literal(math.exp(x.known))
+        return x.tape.literal(math.exp(x.known))
     number, fixed, moving = x.factors()
-    by, first = x.program.exponentials.setdefault(
-        fixed * moving, (number, x.program.term(_EXP, x.place)))
+    by, first = x.tape.exponentials.setdefault(
+        fixed * moving, (number, x.tape.term(_EXP, x.place)))
     times = number / by
     return first ** times if times == int(times) and abs(times) <= _SMALL else (
-        x.program.term(_EXP, x.place))
+        x.tape.term(_EXP, x.place))
 
 
 def expm1(x: Term) -> Term:
     """Return the exponential less 1."""
-    return x.program.term(_EXPM1, x.place)
+    return x.tape.term(_EXPM1, x.place)
 
 
 def law_of(
@@ -290,14 +290,14 @@ def law_of(
         For `hmsa.model.laws.LAWS`.
 
     """
-    program = _Program(len(constants))
+    tape = _Tape(len(constants))
     known, (along, across, _, first, second, _, _) = (
-        program.leaves[:len(constants)], program.leaves[len(constants):])
+        tape.leaves[:len(constants)], tape.leaves[len(constants):])
     total = energy(Strain(first, second, along, across), *known)
 
     @cache
     def compiled() -> tuple[list[float], list[float], list[float]]:
-        return program.compiled(total)
+        return tape.compiled(total)
 
     def packed(numbers: tuple[float, ...]) -> tuple[float, ...]:
         head, literals, steps = compiled()

@@ -119,7 +119,7 @@ template <class R> struct Ogden {
 };
 
 template <class R> struct Formula {
-    // An energy that is written in Python, as programs for itself and its force: steps of an
+    // An energy that is written in Python, as tapes for itself and its force: steps of an
     // operation and two registers (hmsa/model/laws/formula.py), as one number.
     enum Operation {
         sum = 1, sum_fixed, product, product_fixed, inverted, defined, logarithm, of_1_more,
