@@ -279,7 +279,7 @@ def _bends(knots: Array, begins: Sequence[float]) -> Array:
     return np.concatenate(rows)
 
 
-class _Fit:
+class _ModelUpdate:
     """The model with mass, damping and secondary modes as the repeats show them."""
 
     def __init__(
@@ -504,17 +504,17 @@ def learn(
     trials = [replace(x, time=x.time - delay) for x in trials]
     for x in trials:
         sequence.windows(x.time)
-    fit = _Fit(sequence, trials[:1], _noise(trials[0]))
-    sequence = _Sequence(trials[0], targets, actuator, _ends(actuator, fit.found))
+    update = _ModelUpdate(sequence, trials[:1], _noise(trials[0]))
+    sequence = _Sequence(trials[0], targets, actuator, _ends(actuator, update.found))
     residuals = [sequence.residual(x.time, x.stretch) for x in trials]
     best = int(np.argmin([float(x @ x) for x in residuals]))
     trial, residual = trials[best], residuals[best]
     levels = sequence.levels(trial)
     noise = _noise(trial)
     if best:
-        fit = _Fit(sequence, [trials[0], trial], noise, fit.found)
-    slopes = sequence.derivatives(levels, trial.time, fit.found) + _further_derivatives(
-        sequence, trials, best, fit.found)
+        update = _ModelUpdate(sequence, [trials[0], trial], noise, update.found)
+    slopes = sequence.derivatives(levels, trial.time, update.found) + _further_derivatives(
+        sequence, trials, best, update.found)
     size = float(np.ptp(np.append(levels, 0.0)))
     # Regularisation by the ratio of the noise to the expected change, which falls with the
     # residual: near the targets, hysteresis turns large changes into steady-state errors.
@@ -535,7 +535,7 @@ def learn(
         1.0, _LARGEST * size / max(float(np.max(np.abs(change))), 1e-300))
     if failed >= _FAILED:
         change *= 0.0
-    frequencies = fit.frequencies
+    frequencies = update.frequencies
     weaker = [x * frequencies[0] for x in _SHOWN]
     return Learnt(
         sequence.times, np.clip(levels + sequence.held @ change, *limits),

@@ -118,18 +118,18 @@ def lines_of(fit: Fit, own: float, most: int) -> list[Line]:
     total = float(left @ left)
     if total == 0.0:
         return []
-    modes = _Modes.of(fit, own)
+    response = _ModalResponse.of(fit, own)
     ratios = np.exp(np.arange(
         math.log(LEAST_RATIO), math.log(highest), math.log(_SPACING), dtype=np.float64))
     grid = np.array([(x, y) for y in _DAMPINGS for x in ratios.tolist()])
     # A thinned copy for the search.
     thin = slice(None, None, max(len(residual) // _MOST_SAMPLES, 1))
-    table = modes.columns(grid, thin)
+    table = response.columns(grid, thin)
     lines = list[Line]()
     for _ in range(most):
         start = grid[int(np.argmax(_scores(base[thin], table, residual[thin])))]
-        ratio, damping = _refined(modes, base[thin], residual[thin], thin, start, highest)
-        column = modes.columns(np.array([(ratio, damping)]))
+        ratio, damping = _refined(response, base[thin], residual[thin], thin, start, highest)
+        column = response.columns(np.array([(ratio, damping)]))
         direction = _without(base, column)[:, 0]
         norm = float(direction @ direction)
         size = float(direction @ residual) / max(norm, 1e-300)
@@ -166,7 +166,7 @@ def _scores(base: Array, columns: Array, residual: Array) -> Array:
 
 
 def _refined(
-        modes: '_Modes', base: Array, residual: Array, thin: slice, start: Array,
+        response: '_ModalResponse', base: Array, residual: Array, thin: slice, start: Array,
         highest: float) -> tuple[float, float]:
     """Return ratio and damping of the best line near a start."""
     ratio, damping = start.tolist()
@@ -176,14 +176,14 @@ def _refined(
             (min(max(ratio * math.exp(width * x), LEAST_RATIO), highest),
              min(max(damping * math.exp(deep * y), _DAMPED[0]), _DAMPED[1]))
             for x in _STEPS for y in _STEPS])
-        score = _scores(base, modes.columns(grid, thin), residual)
+        score = _scores(base, response.columns(grid, thin), residual)
         ratio, damping = grid[int(np.argmax(score))].tolist()
         width, deep = _SHRINK * width, _SHRINK * deep
     return ratio, damping
 
 
 @dataclass(frozen=True, eq=False)
-class _Modes:
+class _ModalResponse:
     """The field of a recording in steps, and what the first mode does."""
 
     time: Array  # of the motion that a sample shows, shape (n,)
@@ -194,7 +194,7 @@ class _Modes:
     frequencies: Array  # natural frequency of the first mode about each rest in 1/s, shape (m,)
 
     @classmethod
-    def of(cls, fit: Fit, own: float) -> '_Modes':
+    def of(cls, fit: Fit, own: float) -> '_ModalResponse':
         """Return the field and the first mode of a fit."""
         recording, values = fit.recording, fit.values
         setup = ResponseArguments.of(values, ())
