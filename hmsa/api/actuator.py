@@ -27,7 +27,7 @@ from hmsa.api.arguments import (
     whole,
 )
 from hmsa.api.facts import facts, Scales, scales, unquestioned, warn
-from hmsa.errors import assume, BadInputError, check_choice, UnusualWarning
+from hmsa.errors import assume, BadInputError, check_choice, check_number, UnusualWarning
 from hmsa.files import write_text, yaml_text
 from hmsa.interfaces.actuator import parameters_of, planned_from
 from hmsa.interfaces.parameters import (
@@ -316,7 +316,7 @@ class Actuator:
         """
         Return the flux densities in T that hold stretches; a number or an array.
 
-        Raise `BadInputError` if the stretches are no numbers.
+        Raise `BadInputError` if the stretches are no numbers or beyond the limits of the model.
 
         Examples
         --------
@@ -325,15 +325,18 @@ class Actuator:
         [0.0, 0.0346]
 
         """
-        found = self.model.units.level(
-            elastic_force(numbers(stretch, 'stretches'), self.model.material))
+        material, values = self.model.material, numbers(stretch, 'stretches')
+        lower, upper = material.limits
+        for outside in values[~((lower < values) & (values < upper))].tolist():
+            material.check(outside)
+        found = self.model.units.level(elastic_force(values, material))
         return found if np.ndim(found) else float(found)
 
     def stretch(self, flux_density: ArrayLike) -> Any:
         """
         Return the equilibrium stretches at flux densities in T; a number or an array.
 
-        Raise `BadInputError` if the flux densities are no numbers.
+        Raise `BadInputError` if the flux densities are no finite numbers.
 
         Examples
         --------
@@ -342,9 +345,10 @@ class Actuator:
         [1.0, 1.0559]
 
         """
-        load = self.model.units.of_level(
-            numbers(flux_density, 'flux densities', unit='T'))
-        found = equilibrium_stretch(load, self.model.material)
+        values = numbers(flux_density, 'flux densities', unit='T')
+        for wrong in values[~np.isfinite(values)].tolist():
+            check_number('flux density', wrong, 'T')
+        found = equilibrium_stretch(self.model.units.of_level(values), self.model.material)
         return found if np.ndim(found) else float(found)
 
     def report(self) -> Table:

@@ -230,8 +230,8 @@ def numbers(
     if isinstance(value, (tuple, list)):
         value = [plain(x, unit, what) for x in value]
     try:
-        if np.iscomplexobj(value):
-            raise TypeError  # NumPy would drop the imaginary parts
+        if value is None or np.iscomplexobj(value):
+            raise TypeError  # NumPy would make it NaN, or drop the imaginary parts
         found: Array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
         raise BadInputError(f'{what} are {excerpt(value)}: {expected}') from error
