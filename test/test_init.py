@@ -4,6 +4,7 @@ from dataclasses import replace
 import json
 import math
 from pathlib import Path
+import re
 
 from extras import needs
 import numpy as np
@@ -290,6 +291,21 @@ def test_what_is_implausible_is_warned_of_with_the_usual_range(
     assert any(said in x for x in warnings)
     assert err == ''.join(f'hmsa: warning: {x}\n' for x in warnings)
     assert (tmp_path / 'actuator.yaml').exists()
+
+
+@pytest.mark.parametrize(('words', 'said'), [
+    ('--length 25', 'length 25 m'), ('--thickness 1', 'thickness 1 m')])
+def test_a_size_in_another_unit_is_named_where_the_beam_is_impossible(run, words, said):
+    # Of the file, too, which `Actuator` and the nodes read.
+    status, out, err = run('--beam', '--yes', *words.split())
+    assert (status, out) == (2, '')
+    assert err.count('hmsa: error: ') == 1
+    assert err.endswith(f'; {said} is unusual (did you mean mm?)\n')
+    name, value = words.removeprefix('--').split()
+    with pytest.raises(BadInputError, match=re.escape(f'; {said} is unusual')):
+        Actuator.from_parameters({
+            'law.name': 'beam', 'actuator.half_length': 0.0125, 'actuator.half_thickness': 5e-4,
+            f'actuator.half_{name}': 0.5 * float(value)})
 
 
 def test_usual_numbers_are_not_warned_of():

@@ -5,6 +5,7 @@ from dataclasses import replace
 import math
 from typing import Any, TYPE_CHECKING
 
+from hmsa.errors import BadInputError
 from hmsa.interfaces.parameters import (
     ACTUATOR_FIELDS,
     BULK_RATIO,
@@ -14,6 +15,7 @@ from hmsa.interfaces.parameters import (
     THERMAL,
     VISCOELASTIC,
 )
+from hmsa.interfaces.quantities import FORMS, mistakes
 from hmsa.model.creep import Creep, FLOWS
 from hmsa.model.laws import LAWS
 from hmsa.model.laws.beam import ELASTIC_CURVE
@@ -49,8 +51,19 @@ def actuator_from(
     """
     Return the block of ``actuator.*``, times any ``mismatch.*``, with its law and ``modes.*``.
 
-    ``modulus`` replaces the shear modulus that follows from the constants of a law.
+    ``modulus`` replaces the shear modulus that follows from the constants of a law. Raise
+    `BadInputError`, with values that look like mistakes, for an impossible actuator.
     """
+    try:
+        return _actuator_from(values, modulus)
+    except BadInputError as error:
+        law = values.get(LAW_NAME.name)
+        error.args = ('; '.join((
+            str(error), *mistakes(law if law in FORMS else 'block', values))),)
+        raise
+
+
+def _actuator_from(values: Mapping[str, Any], modulus: float | None) -> ActuatorParameters:
     numbers = {name: values[f'actuator.{name}'] for name in ACTUATOR_FIELDS}
     law, elastic = LAWS[values.get(LAW_NAME.name, 'gent')], None
     if law.endless:

@@ -125,16 +125,20 @@ class GivenNumber:
         """Return a value with its unit."""
         return f'{value:g}{self._unit}'
 
+    def mistake(self, value: float) -> str:
+        """Return the likely mistake behind an unusual value in SI; empty if none is known."""
+        hint = '' if self.usual[0] <= value <= self.usual[1] else next(
+            (words for begin, end, words in self.hints if begin <= value <= end), '')
+        return hint and f'{self.words} {self.show(value)} is unusual ({hint})'
+
     def doubt(self, value: float) -> str | None:
         """Return why a value in SI units is implausible and the usual range, None if it is not."""
         low, high = self.usual
         if low <= value <= high:
             return None
-        hint = next((f' ({words})' for begin, end, words in self.hints
-                     if begin <= value <= end), '')
         return (
-            f'{self.words} {self.show(value)} is unusual{hint}: the usual range is {low:g} to '
-            f'{high:g}{self._unit}, {self.source}')
+            f'{self.mistake(value) or f"{self.words} {self.show(value)} is unusual"}: the usual '
+            f'range is {low:g} to {high:g}{self._unit}, {self.source}')
 
 
 QUANTITIES: tuple[GivenNumber, ...] = (
@@ -224,6 +228,13 @@ DAMPING = GivenNumber.of(
     follows=True)
 #: Quantities with a default; all others are given, or set by --yes.
 OPTIONAL = ('bulk_ratio', 'flux_min', 'slew_limit')
+
+
+def mistakes(form: str, values: Mapping[str, float]) -> list[str]:
+    """Return the likely mistakes in the parameters of an actuator of a form."""
+    return [found for x in FORMS[form] if x.parameter in values and (found := x.mistake(
+        # Parameters are half sizes.
+        values[x.parameter] * (2.0 if f'half_{x.key}' in x.parameter else 1.0)))]
 
 
 def default_of(quantity: GivenNumber, given: Mapping[str, float]) -> float:
