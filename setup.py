@@ -46,7 +46,6 @@ SWEEP = [
 ]
 
 
-
 def ros(distro):
     """Return what a ROS 2 distribution brings: rclpy and the messages."""
     return [f'ros-{distro}-common-interfaces', f'ros-{distro}-rclpy[fastrtps]']

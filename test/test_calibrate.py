@@ -84,6 +84,7 @@ def test_a_missing_reading_is_refused_with_its_line(tmp_path, capsys):
 def test_a_coil_like_no_model_gets_a_table_that_the_driver_takes(tmp_path, capsys):
     source, out = tmp_path / 'readings.csv', tmp_path / 'coil.yaml'
     flux = 0.05 * LOOP + 0.02 * np.maximum(LOOP, 0.0)
+
     def write(values):
         source.write_text('current [A],flux_density [mT]\n' + ''.join(
             f'{x},{1e3 * y}\n' for x, y in zip(LOOP, values, strict=True)))

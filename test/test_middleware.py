@@ -129,6 +129,7 @@ def test_what_a_busy_reader_misses_comes_again_sooner_than_by_default(start, wai
         for name in ('default', 'ours')]
     for writer in writers:
         writer.wait_for_output('ready')
+
     def lost_and_early(number):
         reader.popen.send_signal(signal.SIGSTOP)
         for writer in writers:

@@ -327,7 +327,6 @@ def test_status_tells_the_progress_until_at_rest(bench):
         assert status.hardware_id == 'actuator'
 
 
-
 def test_the_file_of_an_identification_is_a_parameter_file(bench, tmp_path):
     file = tmp_path / 'found.yaml'
     file.write_text(

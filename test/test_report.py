@@ -1205,6 +1205,7 @@ def test_thinning_out_takes_any_number_of_points(count):
     if count:
         assert (thin_x[0], thin_x[-1]) == (0.0, count - 1.0)
 
+
 def test_of_many_arrivals_the_worst_are_shown_and_the_table_has_all(part_of):
     sequence = tuple((1.1 if i % 2 else 1.2, 8.0) for i in range(20))
     part = part_of(simulated(sequence, period=200_000, noise=1e-5))

@@ -228,6 +228,7 @@ class WriterThread:
         except OSError as error:
             self._error = self._error or _not_closed(error)
             self._writer.drop_pending()
+
         def count() -> None:
             """Count what can be read, and add the last words."""
             self._writer.check_files()

@@ -189,7 +189,6 @@ ACTUATOR = (
 )
 
 
-
 def _of_laws() -> tuple[ParameterSpec, ...]:
     """Return the constants of all laws; laws share constants of the same name."""
     texts: dict[str, list[str]] = {}

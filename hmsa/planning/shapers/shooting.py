@@ -33,7 +33,7 @@ from hmsa.model.status import Code, RefusedError
 from hmsa.planning.shapers.request import AT_REST, MoveRequest
 
 if TYPE_CHECKING:
-    from hmsa.planning.shapers.request import MoveRequest
+    pass
 
 
 # Factor on the guessed duration of the last ramp, for the period that follows it.
