@@ -19,7 +19,6 @@ from functools import lru_cache
 from itertools import product
 import math
 from operator import itemgetter
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -31,10 +30,6 @@ from hmsa.model.moves import Level, Move
 from hmsa.model.simulation import branches_of, followed_by
 from hmsa.model.status import Code, RefusedError
 from hmsa.planning.shapers.request import AT_REST, MoveRequest
-
-if TYPE_CHECKING:
-    pass
-
 
 # Factor on the guessed duration of the last ramp, for the period that follows it.
 _MORE = 1.25
