@@ -69,6 +69,10 @@ class Board:
         """Return the largest level set after a time."""
         return max((abs(level) for x, level in self.record if x > time), default=0.0)
 
+    def off_within(self, time: float, limit: float) -> bool:
+        """Return whether the coil was off in time, without that for which the host halted."""
+        return self.off_since(time) < limit + self.halted_since(time)
+
     def halted_since(self, time: float) -> float:
         """Return for how long in s the host halted the board after a time."""
         return sum(length for x, length in self._halts if x > time)
@@ -79,7 +83,7 @@ class Board:
             self.unplug()
             controller, line = os.openpty()
             tty.setraw(line)
-            self._fds = controller, line
+            self._fds, self._waiting = (controller, line), b''
             self._port.unlink(missing_ok=True)
             self._port.symlink_to(os.ttyname(line))
 
@@ -107,7 +111,6 @@ class Board:
             self.record.append((monotonic(), level))
 
     def _work(self) -> None:
-        waiting = b''
         looked = monotonic()
         while not self._ended:
             now = monotonic()
@@ -116,11 +119,9 @@ class Board:
             looked = now
             with self._turn:
                 fds = self._fds
-                if fds is None:
-                    waiting = b''
-                elif select.select([fds[0]], [], [], 0.0)[0]:
-                    waiting += os.read(fds[0], 1000)
-                    *lines, waiting = waiting.split(b'\n')
+                if fds is not None and select.select([fds[0]], [], [], 0.0)[0]:
+                    read = self._waiting + os.read(fds[0], 1000)
+                    *lines, self._waiting = read.split(b'\n')
                     for line in lines:
                         if answer := self.answer(self._obey(line.decode())):
                             os.write(fds[0], answer.encode() + b'\n')

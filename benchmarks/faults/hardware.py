@@ -24,7 +24,7 @@ _LEVEL = 0.02
 _BEAT = 0.05
 # As a planner's, in ns: commands with timestamps before a cut-off are refused.
 _LEAD = 200_000_000
-# Timeouts in s: the driver's watchdog, a call, and the firmware's watchdog.
+# Timeouts in s: the driver's watchdog, a call that hangs, and the firmware's watchdog.
 _TIMEOUT, _CALL, _FIRMWARE = 0.5, 0.5, 0.4
 # Timeout in s of a call where the fault is not a call that hangs: nor is a host that halts the
 # board, by up to 5 s.
@@ -44,12 +44,15 @@ class _Bench:
         self.rig, self.board = rig, board
         self._parameters = {
             'hardware': 'benchmarks.faults.serial_coil:SerialCoil',
-            'hardware.port': rig.folder / 'port', 'hardware.timeout': _CALL,
+            'hardware.port': rig.folder / 'port', 'hardware.timeout': _PATIENT_CALL,
             'command_timeout': _TIMEOUT, 'publish_rate': 50.0, **parameters}
-        self.driver: Child = rig.start('driver', self._parameters)
+        self._start()
         self._command = rig.publisher(topics.FLUX_DENSITY_COMMAND)
         self._cut_off = 0  # time in ns that names a cut-off; 0 for none
         ros_entities.subscribe(rig.node, topics.FLUX_DENSITY_RECEIVED, self._on_receipt)
+
+    def _start(self) -> None:
+        self.driver: Child = self.rig.start('driver', self._parameters)
 
     def _on_receipt(self, message: TimeReference) -> None:
         cut_off = message.header.frame_id == CUT_OFF
@@ -57,17 +60,22 @@ class _Bench:
 
     def ready(self) -> None:
         """Wait until the driver accepts commands."""
-        self.rig.spin_until(
-            lambda: self.rig.applied and self._command.get_subscription_count(), 'the driver')
+        self._until(self.rig.spin_until, lambda: (
+            self.rig.applied and self._command.get_subscription_count()), 'the driver')
 
     def switch_on(self) -> None:
         """Set a level in the coil."""
         self.ready()
-        self.beat_until(lambda: self.board.level == _LEVEL or not self.driver.alive, 'the level')
-        if not self.driver.alive:
-            # A busy host halted the board for longer than a call may take.
-            self.driver = self.rig.start('driver', self._parameters)
-            self.beat_until(lambda: self.board.level == _LEVEL, 'the level')
+        self._until(self.beat_until, lambda: self.board.level == _LEVEL, 'the level')
+
+    def _until(
+            self, wait: Callable[..., None], condition: Callable[[], Any], what: str) -> None:
+        """Wait; start the driver again if the host halted the board for longer than a call."""
+        while not (wait(lambda: condition() or not self.driver.alive, what) or condition()):
+            # The board may still answer the driver that has ended: not on a new line.
+            self.board.plug()
+            self.rig.applied.clear()
+            self._start()
 
     def beat_until(
             self, condition: Callable[[], Any], what: str, level: float = _LEVEL, *,
@@ -93,6 +101,10 @@ class _Bench:
         self.beat_until(lambda: not self.driver.alive, 'the end of the driver')
         status = self.driver.popen.poll()
         return -1 if status is None else status
+
+    def spent_since(self, time: float) -> float:
+        """Return the time in s since a time, without that for which the host halted the board."""
+        return monotonic() - time - self.board.halted_since(time)
 
     @property
     def last(self) -> str:
@@ -127,7 +139,8 @@ def _failed(rig: Rig, words: str, reply: str, *texts: str) -> Seen:
         status = bench.ends()
         off = board.off_since(begin)
         return Seen(f'exit {status}, "{bench.last}"', f'off after {off:.2f} s',
-                    status == 1 and all(x in bench.last for x in texts) and off < _TIMEOUT)
+                    status == 1 and all(x in bench.last for x in texts)
+                    and board.off_within(begin, _TIMEOUT))
 
 
 for _name, _word, _call in (
@@ -183,7 +196,7 @@ def _terminated(bench: _Bench, text: str) -> Seen:
     begin = monotonic()
     bench.driver.send(signal.SIGTERM)
     status = bench.ends()
-    spent = monotonic() - begin
+    spent = bench.spent_since(begin)
     return Seen(f'exit {status}, "{bench.last}"', f'ended after {spent:.1f} s',
                 spent < _PROMPT and text in bench.last and status != 0)
 
@@ -241,13 +254,13 @@ def _blocked(bench: _Bench, word: str) -> float:
 
 
 def _hung(rig: Rig, word: str, method: str) -> Seen:
-    with _bench(rig) as bench:
+    with _bench(rig, **{'hardware.timeout': _CALL}) as bench:
         begin = _blocked(bench, word)
         status = bench.ends()
-        spent, off = monotonic() - begin, bench.board.off_since(begin)
+        spent, off = bench.spent_since(begin), bench.board.off_since(begin)
         return Seen(
             f'exit {status} after {spent:.1f} s, "{bench.last}"', f'off after {off:.2f} s',
-            status == 1 and spent < _SOON + _CALL and off < _SOON
+            status == 1 and spent < _SOON + _CALL and bench.board.off_within(begin, _SOON)
             and f'SerialCoil.{method} of joint actuator has not returned for' in bench.last)
 
 
@@ -274,12 +287,12 @@ def _blocked_ended(rig: Rig) -> Seen:
     'driver_gil', 'a call keeps the GIL', 'a C function; firmware with a watchdog',
     'ends within 5 s, names the method; the firmware switches off')
 def _held(rig: Rig) -> Seen:
-    with _bench(rig, _FIRMWARE) as bench:
+    with _bench(rig, _FIRMWARE, **{'hardware.timeout': _CALL}) as bench:
         bench.switch_on()
         begin = monotonic()
         bench.board.answer = lambda _: 'HANG 0 0'
         status = bench.ends()
-        spent = monotonic() - begin
+        spent = bench.spent_since(begin)
         rig.spin_until(lambda: not bench.board.level, 'the firmware')
         return Seen(
             f'exit {status} after {spent:.1f} s, "{bench.last}"',
@@ -300,7 +313,7 @@ def _constructor(rig: Rig) -> Seen:
     'driver_planner_killed', 'planner killed', 'while 1.1 is held',
     'off within command_timeout of the last heartbeat, reported')
 def _planner_killed(rig: Rig) -> Seen:
-    with _bench(rig, **{'hardware.timeout': _PATIENT_CALL}) as bench:
+    with _bench(rig) as bench:
         planner = rig.start('planner')
         bench.ready()
         rig.ready('planner')
@@ -311,12 +324,13 @@ def _planner_killed(rig: Rig) -> Seen:
         rig.spin_until(lambda: not bench.board.level, 'the watchdog')
         off = bench.board.off_since(begin)
         rig.spin_until(lambda: 'no heartbeat' in bench.driver.said, 'that it is said')
-        return Seen('reported', f'off after {off:.2f} s', off < _TIMEOUT + 0.1)
+        return Seen('reported', f'off after {off:.2f} s',
+                    bench.board.off_within(begin, _TIMEOUT + 0.1))
 
 
 def _stalled(rig: Rig, who: str, latest: float) -> Seen:
     """Stop a process for longer than the watchdog waits; ``latest`` is when the coil is off."""
-    with _bench(rig, **{'hardware.timeout': _PATIENT_CALL}) as bench:
+    with _bench(rig) as bench:
         processes = {'driver': bench.driver, 'planner': rig.start('planner', {
             'lead_time': PATIENT_LEAD})}
         bench.ready()
@@ -330,13 +344,13 @@ def _stalled(rig: Rig, who: str, latest: float) -> Seen:
         rig.spin_until(lambda: any(x['code'] == CUT_OFF for x in rig.verdicts), 'the status')
         # The board reads the level after the driver has written it.
         rig.spin_until(lambda: bench.board.off_since(begin) < math.inf, 'the coil to be off')
-        off, halted = bench.board.off_since(begin), bench.board.halted_since(begin)
+        off, in_time = bench.board.off_since(begin), bench.board.off_within(begin, latest)
         rig.spin(1.0)
         again = bench.board.largest_since(begin + off)
         _move_until_on(bench, lambda: rig.setpoint(1.1))
         return Seen(
             f'{again:g} T before the next request', f'off after {off:.2f} s',
-            not again and off < latest + halted)
+            not again and in_time)
 
 
 def _move_until_on(bench: _Bench, request: Callable[[], object]) -> None:
@@ -374,4 +388,5 @@ def _killed(rig: Rig) -> Seen:
         begin = monotonic()
         rig.spin_until(lambda: not bench.board.level, 'the firmware')
         off = bench.board.off_since(begin)
-        return Seen(f'fed: {fed}', f'off after {off:.2f} s', fed and off < _FIRMWARE + 0.1)
+        return Seen(f'fed: {fed}', f'off after {off:.2f} s',
+                    fed and bench.board.off_within(begin, _FIRMWARE + 0.1))
