@@ -57,9 +57,9 @@ def actuator_from(
     try:
         return _actuator_from(values, modulus)
     except BadInputError as error:
-        law = values.get(LAW_NAME.name)
+        form = str(values.get(LAW_NAME.name))
         error.args = ('; '.join((
-            str(error), *mistakes(law if law in FORMS else 'block', values))),)
+            str(error), *mistakes(form if form in FORMS else 'block', values))),)
         raise
 
 
