@@ -57,6 +57,7 @@ class CsvColumns:
 
     columns: dict[str, Array]  # in SI; NaN for a missing value
     lines: Array  # line number of each row
+    with_unit: frozenset[str]  # names of the columns whose unit the file gives
 
     def check_complete(self, path: Path, because: str = '') -> None:
         """Raise `BadInputError`, with a reason if given, unless all cells have finite numbers."""
@@ -83,13 +84,38 @@ class _Place:
         return 2 if self.alias else 1 if self.unit else 0
 
 
-def check_flux_densities(source: object, levels: Array) -> None:
+def remedy(column: str, unit: str, from_csv: bool) -> str:
+    """Return how to give numbers in another unit: in the header of a CSV, or converted."""
+    return (f'write "{column} [{unit}]" in the header of the CSV' if from_csv else
+            f'convert them to {_WRITTEN.get(x := next(iter(_UNITS[column])), x)}')
+
+
+def check_flux_densities(source: object, levels: Array, from_csv: bool = True) -> None:
     """Raise `BadInputError` for more T than any coil has, such as mT read as T."""
     most = float(np.nanmax(np.abs(levels), initial=0.0))
     if most > _STRONGEST:
         raise BadInputError(
             f'{source} has flux densities up to {most:.6g} T: expected at most {_STRONGEST:g} T; '
-            'if they are in mT, write "flux_density [mT]" in the header of the CSV')
+            f'if they are in mT, {remedy("flux_density", "mT", from_csv)}')
+
+
+def read_currents(path: Path) -> tuple[Array, Array]:
+    """
+    Read the columns ``current`` in A and ``flux_density`` in T of a CSV file.
+
+    Raise `BadInputError` if the file cannot be used, or has numbers that look like other units.
+    """
+    table = read_table(path, ('current', 'flux_density'))
+    current, flux = (table.columns[x] for x in ('current', 'flux_density'))
+    most = float(np.nanmax(np.abs(current), initial=0.0))
+    if 'current' not in table.with_unit and most > _UNUSUAL:
+        raise BadInputError(
+            f'{path} has currents up to {most:.6g} without a unit: expected at most '
+            f'{_UNUSUAL:g} A; write "current [mA]" in its header, or "current [A]" if they '
+            'are in A')
+    table.check_complete(path)
+    check_flux_densities(path, flux)
+    return current, flux
 
 
 def _text(path: Path, kind: str) -> str:
@@ -191,19 +217,14 @@ def read_table(
                     'expected a number'
                     + (_decimal_commas(separator) if ',' in parts[place.index] else ''))
             columns[name][i] = value * factors[name]
-    if 'current' in places and not (places['current'].unit or below.get('current')):
-        most = float(np.nanmax(np.abs(columns['current']), initial=0.0))
-        if most > _UNUSUAL:
-            raise BadInputError(
-                f'{path} has currents up to {most:.6g} without a unit: expected at most '
-                f'{_UNUSUAL:g} A; write "current [mA]" in its header, or "current [A]" if they '
-                'are in A')
     for text, stated in _taken(path, places, factors, rest_length):
         if notes is not None:
             notes.append(text)
         elif not stated:
             assume(text)
-    return CsvColumns(columns, np.array([x[0] for x in rows[1 + bool(below):]]))
+    return CsvColumns(
+        columns, np.array([x[0] for x in rows[1 + bool(below):]]),
+        frozenset(name for name, x in places.items() if x.unit or below.get(name)))
 
 
 def _rows(text: str) -> tuple[list[tuple[int, str]], str | None]:

@@ -11,7 +11,7 @@ import pytest
 import hmsa
 from hmsa.api.paths import read_path
 from hmsa.cli import main
-from hmsa.columns import read_table
+from hmsa.columns import read_currents, read_table
 from hmsa.errors import AssumedWarning, BadInputError
 from hmsa.identification.measurement import read_levels
 from hmsa.model.laws.curve import points_in
@@ -142,6 +142,13 @@ def test_another_unit_is_refused_with_what_to_do(csv, text, message):
     wanted = WANTED if 'flux' in text else ('time', 'stretch')
     with pytest.raises(BadInputError, match=message):
         read_table(csv(text), wanted)
+
+
+def test_only_who_wants_currents_of_a_coil_judges_them(csv):
+    path = csv('current,flux_density\n-2000,-0.1\n0,0\n2000,0.1\n')
+    assert read_table(path, ('current', 'flux_density')).columns['current'][-1] == 2000.0
+    with pytest.raises(BadInputError, match='has currents up to 2000 without a unit: expected'):
+        read_currents(path)
 
 
 def test_a_path_that_stands_still_in_time_is_refused_with_its_line(csv):

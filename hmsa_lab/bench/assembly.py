@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hmsa.columns import check_flux_densities, read_table
+from hmsa.columns import read_currents
 from hmsa.errors import BadInputError, excerpt
 from hmsa.model.equations import Array
 from hmsa.model.units import NANOSECONDS
@@ -266,9 +266,7 @@ class CoilModel:
 
 
 def _table_in(path: Path) -> tuple[Array, Array]:
-    found = read_table(path, ('current', 'flux_density')).columns
-    current, flux = found['current'], found['flux_density']
-    check_flux_densities(path, flux)
+    current, flux = read_currents(path)
     if not (len(current) > 2 and np.all(np.diff(current) > 0.0)
             and np.all(np.diff(flux) * (flux[-1] - flux[0]) > 0.0)):
         raise BadInputError(

@@ -173,13 +173,9 @@ def _readings(arguments: argparse.Namespace) -> 'tuple[Array, Array]':
     path = Path(arguments.source)
     if path.suffix.lower() in ('.csv', '.txt', '.tsv') or (
             path.is_dir() and arguments.source not in registered(HARDWARE)):
-        from hmsa.columns import check_flux_densities, read_table
+        from hmsa.columns import read_currents
 
-        table = read_table(path, ('current', 'flux_density'))
-        table.check_complete(path)
-        columns = table.columns
-        check_flux_densities(path, columns['flux_density'])
-        return columns['current'], columns['flux_density']
+        return read_currents(path)
     import numpy as np
 
     from hmsa_lab.bench.assembly import CoilModel
