@@ -243,6 +243,26 @@ def test_what_cannot_be_identified_says_why(block, tmp_path):
         found.to_yaml(tmp_path / 'found.yaml')
 
 
+@pytest.mark.parametrize(('times', 'begins', 'levels', 'said'), [
+    (1e3, 1.0, 1.0, 'times of the array of samples were in ms; if they are, convert them to s'),
+    (1.0, 1e3, 1.0, 'times of the array of commands were in ms; if they are, convert them to s'),
+    (1e3, 1e3, 1.0, 'if all times are in ms, convert them to s'),
+    (1.0, 1.0, 1e3, 'array of commands has flux densities up to 30 T.* in mT, convert them to T')])
+def test_arrays_in_other_units_are_refused_with_advice_for_arrays(times, begins, levels, said):
+    motion = hmsa.Actuator().simulate(LEVELS, until=0.6, noise=1e-4)
+    commands = np.array(LEVELS) * (begins, levels)
+    with pytest.raises(hmsa.BadInputError, match=said) as found:
+        hmsa.identify((times * motion.times, motion.stretches), commands)
+    assert 'CSV' not in str(found.value)
+
+
+def test_arrays_without_a_first_level_are_taken_to_begin_without_field_and_that_is_said():
+    motion = hmsa.Actuator().simulate(LEVELS, until=0.6, noise=1e-4)
+    found = hmsa.identify((motion.times, motion.stretches), LEVELS[1:], free=['remanence'])
+    assert any('before the first level at 0.02 s the field is taken' in x
+               for x in found.result.warnings)
+
+
 @pytest.mark.parametrize(('call', 'said'), [
     (lambda x: hmsa.Actuator(shear_modulus='30kPa'), "shear_modulus is '30kPa': expected"),
     (lambda x: hmsa.Actuator(half_length=-1.0), 'half_length is -1: expected 1e-09 to 1000 m'),

@@ -8,8 +8,6 @@ import os
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from hmsa.api.actuator import Actuator
 from hmsa.api.arguments import columns_of, file_of, mapping_of, names_of, number, suggesting
 from hmsa.api.motion import Motion
@@ -17,7 +15,7 @@ from hmsa.errors import BadInputError, excerpt
 from hmsa.files import may_be_bag, write_text
 from hmsa.identification.files import Belief, belief_in, file_text
 from hmsa.identification.identify import identify as find
-from hmsa.identification.measurement import Measurement, read_csv, recording_of
+from hmsa.identification.measurement import joined, Measurement, read_csv, recording_of
 from hmsa.identification.quantities import free_of, Known
 from hmsa.identification.result import Identification
 from hmsa.model.thermal import checked_temperature
@@ -219,12 +217,11 @@ def identify(
                 'commands are missing: expected times in s and flux densities in T from then on')
         time, stretch = columns_of(samples, ('time', 'stretch'), 'samples')
         times, levels = columns_of(commands, ('time', 'flux_density'), 'commands')
-        if times[0] > time[0]:
-            # The field is zero before the first command.
-            times, levels = np.append(time[0], times), np.append(0.0, levels)
+        notes: list[str] = []
+        times, levels = joined(time, stretch, times, levels, notes)
         recording = Measurement(
             time - time[0], stretch, times - time[0], levels, options.slew_limit,
-            coordinate=block.coordinate)
+            notes=tuple(notes), coordinate=block.coordinate)
     if temperature is not None:
         celsius = checked_temperature(number(temperature, 'temperature', 'degC'))
         base, block = _at(base, celsius), block.at_temperature(celsius)

@@ -13,6 +13,7 @@ import math
 
 import numpy as np
 
+from hmsa.columns import remedy
 from hmsa.errors import BadInputError
 from hmsa.identification import quantities
 from hmsa.identification.defects import GAIN, USUAL_GAIN
@@ -367,16 +368,17 @@ def check_plausible(fit: Fit, unknown: Collection[str]) -> None:
         if name not in fit.free or name in unknown or least <= value <= most:
             continue
         hint = next((
-            f'; if all times are in {x}, write "time [{x}]" in the header of the CSV'
+            f'; if all times are in {x}, {remedy("time", x, recording.from_csv)}'
             for x, y in _FINER.items() if least <= value * y ** power <= most), '')
         if not hint and name == 'remanence' and least <= 1e3 * value <= most:
-            hint = '; if flux densities are in mT, write "flux_density [mT]" in the header'
+            hint = '; if flux densities are in mT, ' + remedy(
+                'flux_density', 'mT', recording.from_csv)
         unit = quantities.QUANTITIES[name].unit
         raise BadInputError(
             f'the motion in {recording.label} corresponds to a {label} of {value:.3g} {unit}, '
             f'with samples {recording.gap:.3g} s apart: expected {least:g} to '
             f'{most:g} {unit}; check that times are in s, flux densities in T, and the size of '
-            f'the actuator in --params-file{hint}')
+            f'the actuator in its parameter file{hint}')
 
 
 def _opposed(recording: Measurement) -> str:

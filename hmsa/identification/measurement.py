@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hmsa.columns import check_flux_densities, CsvColumns, DIVIDED, read_table
+from hmsa.columns import check_flux_densities, CsvColumns, DIVIDED, read_table, remedy
 from hmsa.errors import BadInputError, check_number
 from hmsa.interfaces.topics import PLANNER
 from hmsa.model.delivery import ramps
@@ -79,6 +79,8 @@ class Measurement:
         Kind of position that the samples measure.
     temperature : float
         Temperature of the actuator in degrees Celsius; NaN if it was not measured.
+    from_csv : bool
+        Whether the numbers are those of a CSV, whose header states their units.
     at_rest : bool
         Whether the motion begins at rest, as determined by `identify`.
 
@@ -101,6 +103,7 @@ class Measurement:
     coordinate: Coordinate = STRETCH
     at_rest: bool = True
     temperature: float = math.nan
+    from_csv: bool = False
 
     def __post_init__(self) -> None:
         """Check the arrays."""
@@ -140,7 +143,7 @@ class Measurement:
         if not len(self.levels):
             raise BadInputError(f'{self.label} has no level: expected the flux density in T')
         self._check_scale()
-        check_flux_densities(self.label, self.levels)
+        check_flux_densities(self.label, self.levels, self.from_csv)
         spread = float(np.quantile(self.stretch, 0.99) - np.quantile(self.stretch, 0.01))
         # The range of white noise is 4.65 standard deviations, as is that of its increments.
         jitter = float(np.median(np.abs(np.diff(self.stretch)))) / 0.954
@@ -401,22 +404,7 @@ def read_csv(
     time, stretch = table.columns['time'][keep], table.columns['stretch'][keep]
     if commands is not None:
         times, levels = read_levels(commands, notes)
-        check_flux_densities(commands, levels)
-        if time[0] - times[-1] > _ANOTHER_CLOCK:
-            raise BadInputError(
-                f'{commands} ends at {times[-1]:.9g} s, and the first sample of {path} is at '
-                f'{time[0]:.9g} s: expected times of one clock, not seconds since a start '
-                'beside the time of day')
-        if len(time) >= FEWEST:
-            _check_units(path, time, stretch, commands, times, levels)
-        if times[0] > time[-1]:
-            raise BadInputError(
-                f'{commands} begins at {times[0]:.9g} s, after the last sample of {path} at '
-                f'{time[-1]:.9g} s: expected times of one clock')
-        if times[0] > time[0]:
-            # The field is zero before the first command.
-            times, levels = np.append(time[0], times), np.append(0.0, levels)
-            notes.append(f'before the first level at {times[1]:.6g} s the field is taken to be 0')
+        times, levels = joined(time, stretch, times, levels, notes, (path, commands))
         earlier = 0.0
     else:
         times, levels, earlier, used = _sampled_levels(
@@ -425,7 +413,37 @@ def read_csv(
     # Subtract the first time: seconds since an epoch leave few digits for differences.
     return Measurement(
         time - time[:1], stretch, times - time[:1], levels, slew_limit, earlier, str(path),
-        tuple(dict.fromkeys(notes)), coordinate)
+        tuple(dict.fromkeys(notes)), coordinate, from_csv=True)
+
+
+def joined(
+        time: Array, stretch: Array, times: Array, levels: Array, notes: list[str],
+        sources: tuple[Path, Path] | None = None) -> tuple[Array, Array]:
+    """
+    Return times and levels from the first sample on, which begin with 0 T unless given.
+
+    ``notes`` receives what is assumed; ``sources`` are the CSV files of samples and levels, None
+    for arrays. Raise `BadInputError` if the times are not those of one clock in s.
+    """
+    path, commands = sources or ('the array of samples', 'the array of commands')
+    check_flux_densities(commands, levels, sources is not None)
+    if time[0] - times[-1] > _ANOTHER_CLOCK:
+        raise BadInputError(
+            f'{commands} ends at {times[-1]:.9g} s, and the first sample of {path} is at '
+            f'{time[0]:.9g} s: expected times of one clock, not seconds since a start '
+            'beside the time of day')
+    # Those of arrays may be in any order, which `Measurement` refuses.
+    if len(time) >= FEWEST and all(np.all(np.diff(x) > 0.0) for x in (time, times)):
+        _check_units(str(path), time, stretch, str(commands), times, levels, sources is not None)
+    if times[0] > time[-1]:
+        raise BadInputError(
+            f'{commands} begins at {times[0]:.9g} s, after the last sample of {path} at '
+            f'{time[-1]:.9g} s: expected times of one clock')
+    if times[0] > time[0]:
+        # The field is zero before the first command.
+        notes.append(f'before the first level at {times[0]:.6g} s the field is taken to be 0')
+        times, levels = np.append(time[0], times), np.append(0.0, levels)
+    return times, levels
 
 
 def _kept(path: Path, table: CsvColumns, notes: list[str]) -> NDArray[np.int64]:
@@ -480,8 +498,8 @@ def _ordered(
 
 
 def _check_units(
-        path: Path, time: Array, stretch: Array, commands: Path, times: Array, levels: Array
-) -> None:
+        path: str, time: Array, stretch: Array, commands: str, times: Array, levels: Array,
+        from_csv: bool) -> None:
     """Raise `BadInputError` if times of samples and of levels have different units."""
     def unexplained(factor: float) -> float:
         # Variance that remains if each level has its own mean.
@@ -498,7 +516,7 @@ def _check_units(
                     f'{path} has samples from {time[0]:.6g} to {time[-1]:.6g} s and {commands} '
                     f'levels from {times[0]:.6g} to {times[-1]:.6g} s: expected both in s, but '
                     f'the motion follows the levels as if the times of {wrong} were in {unit}; '
-                    f'if they are, write "time [{unit}]" in its header')
+                    f'if they are, {remedy("time", unit, from_csv)}')
 
 
 def _sampled_levels(
