@@ -270,3 +270,23 @@ def test_arrays_and_files_of_a_path_are_followed_too(tmp_path, capsys):
     assert float(row.split()[-1]) == pytest.approx(leaves, rel=0.05)
     assert main(['plan', '--path', str(tmp_path / 'path.csv')]) == 2
     assert '--path CSV with --params-file' in capsys.readouterr().err
+
+
+def test_times_in_ms_are_named_as_the_reason_for_too_many_levels(tmp_path, capsys):
+    times = np.linspace(0.0, 800.0, 81)
+    stretches = 1.0 + 0.1 * np.sin(np.pi * times / 800.0) ** 2
+    reason = r'levels: .*points are 10 s, 894 natural periods apart: check that its times are in s'
+    with pytest.raises(RefusedError, match=reason):
+        Actuator().follow(times, stretches)
+    Actuator().to_yaml(tmp_path / 'block.yaml')
+    for unit, status in (('', 2), (' [ms]', 0)):
+        (tmp_path / 'path.csv').write_text(f'time{unit},stretch\n' + ''.join(
+            f'{x:g},{y!r}\n' for x, y in zip(times, stretches.tolist(), strict=True)))
+        assert main(['plan', '--path', str(tmp_path / 'path.csv'), '--params-file',
+                     str(tmp_path / 'block.yaml')]) == status
+        err = capsys.readouterr().err
+        assert ('write "time [ms]" in the header of the CSV' in err) is (status == 2)
+    # A path that is too long for another reason is told that one.
+    dense = np.arange(0.0, 1000.0, 0.005)
+    with pytest.raises(RefusedError, match='at most 200000; send it in parts'):
+        Actuator().follow(dense, 1.0 + 0.1 * np.sin(np.pi * dense / dense[-1]) ** 2)

@@ -246,11 +246,18 @@ def _actuator(arguments: argparse.Namespace) -> 'Actuator':
 def _along(actuator: 'Actuator', arguments: argparse.Namespace) -> int:
     """Plan a path from a file, and print what it demands; raise `BadInputError` for others."""
     from hmsa.api.paths import following, path_of, read_path
+    from hmsa.columns import remedy
+    from hmsa.model.status import Code, RefusedError
 
     if extra := [f'--{x}' for x in ('shaper', 'start', 'amplifier') if getattr(arguments, x)]:
         raise BadInputError(f'--path and {extra[0]} are given: expected only one of them')
-    points = read_path(arguments.path)
-    plan, per_ampere = actuator.follow(*points), arguments.tesla_per_ampere
+    points, per_ampere = read_path(arguments.path), arguments.tesla_per_ampere
+    try:
+        plan = actuator.follow(*points)
+    except RefusedError as error:
+        if error.code is Code.TOO_LONG:
+            error.args = (f'{error}; if times are in ms, {remedy("time", "ms", True)}',)
+        raise
     if arguments.out is not None:
         plan.save(arguments.out)
     found = following(plan, path_of(actuator, (*points, None, None)))

@@ -556,11 +556,15 @@ def _edges(request: MoveRequest, path: Path, tolerance: float) -> tuple[float, A
         longest = np.maximum(longest, delivery.period)
     each = np.ceil(spans[:, 0] / longest)
     if not np.sum(each) <= _MOST:
+        gap = float(np.median(spans))
+        apart = gap * request.frequency / (2.0 * math.pi)
         raise RefusedError(
             Code.TOO_LONG,
-            f'the path takes {np.sum(each):.3g} levels: expected at most {_MOST}; send it in '
-            'parts, or allow a larger deviation from it (path_tolerance of the planner, tolerance '
-            'in Python)')
+            f'the path takes {np.sum(each):.3g} levels: expected at most {_MOST}; ' + (
+                f'its points are {request.units.time_text(gap)}, {apart:.3g} natural periods '
+                'apart: check that its times are in s; ' if apart > 1.0 else '') +
+            'send it in parts, or allow a larger deviation from it (path_tolerance of the '
+            'planner, tolerance in Python)')
     edges = np.append(np.concatenate([
         begin + length * np.arange(count) / count for begin, length, count in zip(
             breaks[:-1].tolist(), spans[:, 0].tolist(), each.astype(int).tolist(),
