@@ -35,6 +35,7 @@ import sys
 import time
 from typing import Any
 
+from conftest import without_progress
 from markdown_it import MarkdownIt
 import yaml
 
@@ -355,7 +356,7 @@ def console(block: Block) -> list[tuple[str, str]]:
 
 def compare(shown: str, printed: str, place: str) -> None:
     """Raise `Failure` unless the output agrees with the page."""
-    if not alike(shown, printed):
+    if not alike(shown, without_progress(printed)):
         raise Failure(
             f'{place}: the page shows\n{shown}\nbut this was printed\n{printed}')
 
