@@ -285,6 +285,20 @@ def test_a_sensor_that_rounds_at_rest_is_not_frozen():
     assert 'frozen' in judge(time, np.minimum(stretch, 1.3), setpoint()).message
 
 
+@pytest.mark.parametrize('noise', [0.0, 1e-4, 1e-3])
+def test_a_sensor_at_the_end_of_its_range_shows_no_arrival(noise):
+    # It rests at 1.12, and the sensor shows at most 1.1005, within the tolerance of 1.1.
+    time = np.arange(0.0, 0.6, 1e-3)
+    motion = 1.12 - 0.12 * np.exp(-20.0 * time) * np.cos(OMEGA * time)
+    motion += noise * np.random.default_rng(2).standard_normal(len(time))
+    asked = setpoint(target=1.1, start=1.0, arrival=300 * MS, end=None)
+    found = judge((1e9 * time).astype(np.int64), np.minimum(motion, 1.1005), asked)
+    assert found.verdict == 'unobserved'
+    assert 'exactly 1.1005 in the last' in found.message
+    assert 'it is at the end of its range' in found.message
+    assert judge((1e9 * time).astype(np.int64), motion, asked).verdict == 'off_target'
+
+
 @pytest.mark.parametrize('freedom', [1.0, 2.0, 3.0, 4.5, 10.0, 300.0])
 def test_the_quantile_of_students_t_is_that_of_scipy(freedom):
     assert _ringing.quantile(freedom, 0.995, 2.5758293) == pytest.approx(

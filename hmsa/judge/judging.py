@@ -59,6 +59,9 @@ _SAME = 1e-6
 _SHOWN = 0.2
 # Number of changes below which the rounding of a sensor is not tested.
 _FEW_CHANGES = 3
+# A sensor is at an end of its range if it shows the same extreme for this many samples after a
+# change of more than this fraction of the largest one, unlike a motion that fades.
+_SAME_SAMPLES, _SUDDEN = 3, 0.05
 _NO_SENSOR = SensorModel()
 
 
@@ -235,11 +238,24 @@ def _frozen(values: Array, setpoint: RequestedSetpoint) -> str:
     # A motion that fades becomes ever slower, and a sensor that rounds moves by whole steps.
     step = float(np.min(changes[moved]))
     rounds = _whole(changes[moved] / step)
+    if not rounds and values[-1] in cut_off_at(values):
+        return f'{words}, and never beyond: it is at the end of its range'
     # And one that ends where it was to end, as in a simulation without noise, is at rest there.
     ends = abs(float(values[-1]) - setpoint.target) < _FADED * setpoint.step
     if rounds or ends or np.median(before) < _FADED * setpoint.step:
         return ''
     return f'{words}: it is frozen'
+
+
+def cut_off_at(values: Array) -> list[float]:
+    """Return the extremes at which a sensor that does not round seems to cut values off."""
+    changes = np.abs(np.diff(values))
+    edges = np.flatnonzero(changes) + 1
+    if len(edges) < _FEW_CHANGES:
+        return []
+    same = values[edges[:-1]][(np.diff(edges) >= _SAME_SAMPLES) & (
+        changes[edges[:-1] - 1] > _SUDDEN * np.max(changes))]
+    return [x for x in (float(np.min(values)), float(np.max(values))) if x in same]
 
 
 def _rounded_to(values: Array, fewest: int = 1) -> float:
