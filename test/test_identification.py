@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.bench_identification import levels_of
+from hmsa.api.actuator import Actuator
 from hmsa.errors import BadInputError
 from hmsa.identification import modal
 from hmsa.identification.fit import fit
@@ -503,6 +504,32 @@ def test_a_switch_at_the_end_of_its_interval_does_not_keep_a_search_from_converg
         noise = np.random.default_rng(seed).normal(0.0, 1e-3, len(time))
         found = identify(Measurement(time, seen + noise, switches, levels, earlier=1e-3))
         assert found.fit.converged
+
+
+@pytest.mark.parametrize(('rate', 'limit', 'share'), [
+    (400.0, 1.07, 0.22), (3600.0, 1.10, 0.025), (20000.0, 1.07, 0.22), (20000.0, 1.10, 0.025)])
+@pytest.mark.parametrize('noise', [0.0, 1e-4, 1e-3])
+def test_a_sensor_that_cuts_off_is_named_at_any_sampling_rate(rate, limit, share, noise):
+    commands = np.array([(0.0, 0.0), (0.05, 0.03), (0.2, -0.02), (0.35, 0.02), (0.5, 0.0)])
+    motion = Actuator().simulate(commands, until=0.7, rate=rate, noise=noise)
+
+    def recording(stretch):
+        return Measurement(motion.times, stretch, *commands.T)
+
+    seen = np.minimum(motion.stretches, limit)
+    assert np.mean(seen == limit) == pytest.approx(share, abs=0.01)
+    try:
+        said = recording(seen).notes[0]
+    except BadInputError as error:
+        said = str(error)
+        assert share > 0.05 or 'is cut off 2 times' in said
+    else:
+        assert share < 0.05
+    assert f'{limit:g}' in said
+    assert 'expected a sensor within its range' in said or 'the sensor seems to cut' in said
+    assert recording(motion.stretches).notes == ()
+    for digits in (3, 4, 5, 6):
+        assert recording(np.round(motion.stretches, digits)).notes == ()
 
 
 @pytest.mark.parametrize(('change', 'message'), [
