@@ -23,21 +23,32 @@ def replacing(path: Path) -> Iterator[Path]:
     Yield a temporary file that replaces ``path`` once complete; on failure, keep the old file.
 
     Links are followed, devices are written to directly. Raises `BadInputError` if the file cannot
-    be written, or is a broken link.
+    be written, is write-protected, or is a broken link.
     """
+    with _beside(path) as (beside, target):
+        yield beside
+        if beside != target:
+            os.replace(beside, target)
+
+
+@contextmanager
+def _beside(path: Path) -> Iterator[tuple[Path, Path]]:
+    """Yield a temporary name beside the file that a path means, and the file; devices are both."""
     try:
         if path.is_symlink() and not path.exists():
             raise BadInputError(
                 f'cannot write {path}: it is a link to nothing; remove it or name another file')
         target = path.resolve()
+        if target.exists() and not os.access(target, os.W_OK):
+            raise BadInputError(
+                f'cannot write {path}: it is write-protected; expected another name')
         if target.exists() and not stat.S_ISREG(target.stat().st_mode):
-            yield target
+            yield target, target
             return
         # Processes on two hosts may have the same number.
         beside = target.with_name(f'.{target.name}.{uuid.uuid4().hex}.part')
         try:
-            yield beside
-            os.replace(beside, target)
+            yield beside, target
         finally:
             beside.unlink(missing_ok=True)
     except OSError as error:
@@ -74,6 +85,9 @@ def check_targets(*targets: Path | None, sources: Iterable[Path | None] = ()) ->
                if place in written else '')
         if why:
             raise BadInputError(f'cannot write {target}: {why}')
+        with _beside(target) as (beside, file):
+            if beside != file:
+                beside.touch()  # now, not after the work
         written.add(place)
 
 

@@ -24,6 +24,8 @@ import pytest
 from hmsa.cli import build_parser, main, split_ros_args, terminal
 from hmsa.cli.completion import commands_of
 from hmsa.cli.terminal import progress
+from hmsa.errors import BadInputError
+from hmsa.files import write_text
 from hmsa.planning.shapers import SHAPERS
 from hmsa.plugins import COMMANDS, NODES, registered
 
@@ -123,6 +125,37 @@ def test_no_command_writes_over_what_it_reads_or_wrote(
     assert main(command.split()) == 2
     assert f'cannot write {file}: ' in capsys.readouterr().err
     assert {x.read_text() for x in tmp_path.iterdir()} == {'zeta\n0.1\n'}
+
+
+# Nobody creates a file in /proc, not even root.
+@pytest.mark.parametrize('command', [
+    'excite --params-file in.yaml --out /proc/levels.csv',
+    'identify in.csv --commands in.csv --out /proc/found.yaml',
+    'tune 1.1:1 --simulate --report /proc/tuned.html', 'learn in.csv --out /proc/levels.csv',
+    'plan 1.1:1 --params-file in.yaml --out /proc/levels.csv',
+    'calibrate latency --simulate --params-file in.yaml --out /proc/found.yaml'])
+def test_a_folder_without_write_permission_is_refused_before_the_work(
+        command, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(command.split()) == 2
+    err = capsys.readouterr().err
+    assert err.startswith('hmsa: error: cannot write /proc/')
+    assert err.endswith('expected a folder with write permission and room\n')
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_write_protected_file_is_not_replaced(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path('kept.yaml').write_text('kept')
+    Path('kept.yaml').chmod(0o444)
+    # Root may write anything.
+    monkeypatch.setattr(os, 'access', lambda path, _: bool(Path(path).stat().st_mode & 0o200))
+    assert main(['init', '--yes', '--force', '--out', 'kept.yaml']) == 2
+    assert 'cannot write kept.yaml: it is write-protected' in capsys.readouterr().err
+    with pytest.raises(BadInputError, match='it is write-protected'):
+        write_text(Path('kept.yaml'), 'new')
+    assert Path('kept.yaml').read_text() == 'kept'
+    assert [x.name for x in tmp_path.iterdir()] == ['kept.yaml']
 
 
 @pytest.mark.slow
