@@ -34,7 +34,7 @@ def test_topics_are_selected_by_name_expression_and_exclusion():
 
 def test_commands_pass_only_by_name():
     free = Filter()
-    assert free.passes('/left/flux_density_command')
+    assert free.selects('/left/flux_density_command')
     for topic in ('/left/flux_density_command', '/planner/joint_trajectory',
                   '/planner/setpoint'):
         for chosen, withheld in (

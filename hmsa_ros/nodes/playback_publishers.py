@@ -42,7 +42,7 @@ def create_senders(
     """
     held = reader.topics
     full = {name: full_name(node, name) for name in held}
-    chosen = [name for name in held if selection.passes(full[name])]
+    chosen = [name for name in held if selection.selects(full[name])]
     if len(chosen) > MOST_TOPICS:
         raise BadInputError(
             f'{reader.path} has {len(chosen)} topics to send: expected at most {MOST_TOPICS}; '

@@ -62,9 +62,16 @@ class _Choice:
                     f'parameter {parameter} is {expression!r}: expected a regular expression '
                     f'({error})') from error
 
-    def _excludes(self, topic: str) -> bool:
+    def excludes(self, topic: str) -> bool:
+        """Return whether a topic is excluded, which takes precedence."""
         return topic in self.exclude_topics or bool(
             self.exclude_regex and re.search(self.exclude_regex, topic))
+
+    def selects(self, topic: str) -> bool:
+        """Return whether a topic is selected by name or expression, or there is no selection."""
+        return not self.excludes(topic) and bool(
+            topic in self.topics or self.regex and re.search(self.regex, topic)
+            or not (self.topics or self.regex))
 
 
 @dataclass(frozen=True)
@@ -87,15 +94,9 @@ class Selection(_Choice):
 
     def wants(self, topic: str) -> bool:
         """Return whether to record a topic; those in ``topics`` are, unless excluded."""
-        if self._excludes(topic):
+        if topic not in self.topics and topic_or_service_is_hidden(topic):
             return False
-        if topic in self.topics:
-            return True
-        if topic_or_service_is_hidden(topic):
-            return False
-        if self.regex and re.search(self.regex, topic):
-            return True
-        return self.all_topics or not (self.topics or self.regex)
+        return self.selects(topic) or self.all_topics and not self.excludes(topic)
 
 
 @dataclass(frozen=True)
@@ -103,16 +104,6 @@ class Filter(_Choice):
     """Topics to play, by full names or expressions, and commands that are permitted."""
 
     expressions = ('play.regex_to_filter', 'play.exclude_regex_to_filter')
-
-    def passes(self, topic: str) -> bool:
-        """Return whether a topic is selected, commands aside; exclusion takes precedence."""
-        if self._excludes(topic):
-            return False
-        if topic in self.topics:
-            return True
-        if self.regex:
-            return re.search(self.regex, topic) is not None
-        return not self.topics
 
     def withholds(self, topic: str, resolved: str, type_name: str) -> bool:
         """Return whether a topic, resolved for publishing, is a command not selected by name."""
