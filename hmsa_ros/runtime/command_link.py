@@ -268,7 +268,7 @@ class CommandLink:
             If no receipt has shown the offset of its clock.
 
         """
-        offset = self.receipts.offset_of(joint)
+        offset = self.receipts.clock(joint).offset
         if offset is None:
             raise ValueError(f'the clock offset of joint {joint} is unknown')
         when = 'come too late' if offset.ahead > 0 else (
@@ -283,7 +283,7 @@ class CommandLink:
         Its plan is dropped if it is so far ahead that all commands come too late, or behind by
         more than the samples of a start may be; or if it was set in the middle of a move.
         """
-        offset, step = self.receipts.offset_of(joint), self.receipts.take_step(joint)
+        offset, step = self.receipts.clock(joint).offset, self.receipts.take_step(joint)
         if offset is None:
             self.apart.discard(joint)
             return None

@@ -140,7 +140,7 @@ class Deviations:
         if len(sent) > _REMEMBERED:
             del sent[next(iter(sent))]
         if stamp < now:
-            self.lateness.missed(now - stamp, self._receipts.steady)
+            self.lateness.missed(now - stamp, self._receipts.steady())
             self._report_advice()
 
     def applied(
@@ -161,7 +161,7 @@ class Deviations:
             sent = self._sent.get(joint, {}).get(due)
             self.lateness.note(
                 found.late, joint, due, tolerance,
-                2.0 * planner.vibration(1, found.change) / step, self._receipts.steady,
+                2.0 * planner.vibration(1, found.change) / step, self._receipts.steady(),
                 None if sent is None else due - sent)
             expected, uneven = self.lateness.expected, self.lateness.uneven
             for other in self._group.planners.values():
@@ -216,7 +216,7 @@ class Deviations:
             if stamp >= now - late or not self._group.may_resume(name):
                 continue
             for _ in range(planner.drop_missed(now, tolerance)):
-                self.lateness.missed(now - stamp, self._receipts.steady)
+                self.lateness.missed(now - stamp, self._receipts.steady())
             self._report_advice()
             self.replan(name)
 
@@ -281,7 +281,7 @@ class Deviations:
     def _report_advice(self) -> None:
         if self._late_due():
             # The receipts that show the cause may still be under way.
-            self._advise_at = self._receipts.steady + (_CAUSE if self._receipts else 0)
+            self._advise_at = self._receipts.steady() + (_CAUSE if self._receipts else 0)
 
     @property
     def advises(self) -> bool:
@@ -290,7 +290,7 @@ class Deviations:
 
     def advise(self) -> None:
         """Give advice on late commands, if it is due."""
-        if self._advise_at is not None and self._receipts.steady >= self._advise_at:
+        if self._advise_at is not None and self._receipts.steady() >= self._advise_at:
             self._advise_at = None
             self._note(self.advice)
 

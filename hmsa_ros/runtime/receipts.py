@@ -95,7 +95,7 @@ class DeviceClock:
         if len(self._sent) > _SENT:
             del self._sent[next(iter(self._sent))]
 
-    def awaits(self, command: int | None) -> bool:
+    def awaits(self, command: int) -> bool:
         """Return whether a receipt of a command, given by its timestamp, is awaited."""
         return command in self._sent
 
@@ -215,6 +215,30 @@ class _Receiver:
         self.delayed = time, steady
         return True
 
+    def void(self) -> None:
+        """Expect no acknowledgement of the commands sent so far."""
+        self.clock.lost()
+        self.unanswered = self.level = None
+
+    def acknowledge(self, command: int, *, late: bool) -> bool:
+        """Record the newest command that has arrived; return whether the device restarted."""
+        restarted = self.command != 0 and command == 0
+        self.command = command
+        if restarted:
+            # Commands that were sent to the previous device are lost.
+            self.void()
+            self.acknowledged = 0
+        if self.clock.awaits(command):
+            self.unanswered = None
+            if not late:
+                self.acknowledged = command
+                if self.level is not None and command >= self.level:
+                    self.level = None
+        if late:
+            # Also after its acknowledgement: a driver that stood still drops what it has accepted.
+            self.acknowledged, self.level = min(self.acknowledged, command - 1), command
+        return restarted
+
 
 class Receipts:
     """
@@ -225,7 +249,8 @@ class Receipts:
     """
 
     def __init__(self, steady: Callable[[], int]) -> None:
-        self._steady = steady
+        #: Returns the steady time in ns.
+        self.steady = steady
         self.joints: dict[str, _Receiver] = {}
         self._looked: int | None = None
         self._disturbances: deque[Disturbance] = deque(maxlen=_REMEMBERED)
@@ -248,7 +273,7 @@ class Receipts:
         if known is None:
             return
         if known.unanswered is None:
-            known.unanswered = self._steady()
+            known.unanswered = self.steady()
         if level:
             known.level = stamp
         known.clock.sent(stamp, now)
@@ -269,7 +294,7 @@ class Receipts:
         are ``comparable`` if each side has its own clock: a shared clock may be slowed down or
         paused. A device has restarted if it reports no command after it reported one.
         """
-        steady = self._steady()
+        steady = self.steady()
         known = self.joints.get(joint)
         if known is None:
             known = self.joints[joint] = _Receiver(steady)
@@ -277,35 +302,19 @@ class Receipts:
             return False
         if steady - known.arrived > _STALE:
             self._disturbed(known.arrived, _outage(joint, steady - known.arrived))
-        restarted = known.command != 0 and command == 0
-        if command is not None:
-            known.command = command
-        if restarted:
-            # Commands that were sent to the previous device are lost.
-            known.clock.lost()
-            known.unanswered = known.level = None
-            known.acknowledged = 0
         known.arrived, known.time, known.missing, known.delayed = steady, time, 0, None
-        if command is not None and known.clock.awaits(command):
-            known.unanswered = None
-            if not late:
-                known.acknowledged = command
-                if known.level is not None and command >= known.level:
-                    known.level = None
-        if late and command is not None:
-            # Also after its acknowledgement: a driver that stood still drops what it has accepted.
-            known.acknowledged, known.level = min(known.acknowledged, command - 1), command
+        restarted = command is not None and known.acknowledge(command, late=late)
         if comparable:
             known.step += known.clock.received(time, command, now, steady)
         return restarted
 
     def _disturbed(self, begin: int, words: str) -> None:
-        self._disturbances.append(Disturbance(begin, self._steady(), words))
+        self._disturbances.append(Disturbance(begin, self.steady(), words))
 
     def take_disturbances(self) -> list[Disturbance]:
         """Return the disturbances since the last call, and those that last."""
         for name, known in self.joints.items():
-            if (silence := self._steady() - known.arrived) > _STALE:
+            if (silence := self.steady() - known.arrived) > _STALE:
                 self._disturbed(known.arrived, _outage(name, silence))
         found = list(self._disturbances)
         self._disturbances.clear()
@@ -313,9 +322,7 @@ class Receipts:
 
     def void(self, joint: str) -> None:
         """Expect no acknowledgement of the commands sent so far, since they are rejected."""
-        known = self._known(joint)
-        known.clock.lost()
-        known.unanswered = known.level = None
+        self._known(joint).void()
 
     def since(self, joint: str, time: int) -> bool:
         """Return whether a joint's newest receipt is no older than a time of its device."""
@@ -348,9 +355,9 @@ class Receipts:
 
     def clock_set(self) -> None:
         """Record that the planner's clock was set."""
-        self._disturbed(self._steady() - _STALE, 'the clock of the planner was set')
+        self._disturbed(self.steady() - _STALE, 'the clock of the planner was set')
         for known in self.joints.values():
-            known.clock.set(self._steady())
+            known.clock.set(self.steady())
             known.acknowledged, known.level = 0, None
 
     def take_step(self, joint: str) -> int:
@@ -361,7 +368,7 @@ class Receipts:
 
     def look(self) -> list[str]:
         """Return the joints whose device has fallen silent, or is received again."""
-        steady = self._steady()
+        steady = self.steady()
         # Before the first look, a node may still be starting.
         absent, self._looked = 0 if self._looked is None else steady - self._looked, steady
         changed: list[str] = []
@@ -384,12 +391,7 @@ class Receipts:
         """Return whether a command has been unacknowledged for longer than ``patience`` in ns."""
         known = self.joints.get(joint)
         return known is not None and known.unanswered is not None and (
-            self._steady() - known.unanswered > patience)
-
-    @property
-    def steady(self) -> int:
-        """The steady time in ns."""
-        return self._steady()
+            self.steady() - known.unanswered > patience)
 
     @property
     def words(self) -> str:
@@ -409,17 +411,9 @@ class Receipts:
                     '(then restart it)')
         return ''
 
-    def lag(self, joint: str) -> int | None:
-        """Return the smallest age in ns of a joint's receipts at arrival; None for no receipt."""
-        return self._known(joint).clock.lag
-
-    def is_past(self, joint: str, time: int, now: int) -> bool:
-        """Return whether a time of a device can have passed by one of the planner's clock."""
-        return self._known(joint).clock.is_past(time, now)
-
-    def offset_of(self, joint: str) -> Offset | None:
-        """Return the clock offset of a joint's device; None if unknown."""
-        return self._known(joint).clock.offset
+    def clock(self, joint: str) -> DeviceClock:
+        """Return the clock of a joint's device, of which nothing is known without receipts."""
+        return self._known(joint).clock
 
     def figures(self) -> dict[str, object]:
         """Return the values of the clock offset for /diagnostics, if it is known."""

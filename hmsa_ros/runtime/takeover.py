@@ -184,7 +184,7 @@ class Takeover:
         if seen.lag is None and abs(self._around.clock() - seen.stamp) <= _ANOTHER_CLOCK:
             return
         lag = self._around.clock() - seen.stamp if seen.lag is None else seen.lag
-        known, most = self._receipts.lag(name), settings.takeover_max_age
+        known, most = self._receipts.clock(name).lag, settings.takeover_max_age
         agrees = known is not None and abs(known) <= most
         if abs(lag) <= most or 0 < lag <= _OLDEST and agrees:
             # It is in time, or the clocks agree and the sample itself is delayed.
