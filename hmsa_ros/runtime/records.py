@@ -1,7 +1,7 @@
 """What goes into a planner at work, what comes out, and what it asks its caller."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from typing import Any, NamedTuple, TYPE_CHECKING
 
@@ -120,11 +120,11 @@ class Stop:
 Request = Trajectory | StretchRequest | Stop
 
 
-def check_request(
+def accepted(
         request: Request, joints: Sequence[str], settings: Settings, now: int, *,
-        active: bool) -> None:
+        active: bool) -> Request:
     """
-    Check that a request can be accepted at a time in ns.
+    Return what a request at a time in ns asks for, under the settings.
 
     Raises `RefusedError` if the planner is inactive or has no time, if a joint is unknown,
     repeated or missing, or if there are too many setpoints.
@@ -142,7 +142,24 @@ def check_request(
         raise RefusedError(
             Code.UNKNOWN_JOINT, f'joint {request.joint!r}: expected one of {", ".join(joints)}')
     if not isinstance(request, Trajectory):
-        return
+        return request
+    _check_joints(request, joints, settings)
+    if not request.count:
+        # As for a joint_trajectory_controller; goals are checked before.
+        return Stop(request.name)
+    count = request.count * len(request.joints)
+    if count > settings.max_points:
+        raise RefusedError(
+            Code.TOO_LONG,
+            f'the trajectory has {count} setpoints: expected at most {settings.max_points}, the '
+            'parameter max_points; send it in parts, each with its start as timestamp')
+    if settings.trajectory_mode == 'rest' and not request.follows:
+        return replace(request, path=None)
+    return request
+
+
+def _check_joints(request: Trajectory, joints: Sequence[str], settings: Settings) -> None:
+    """Refuse unknown joints, and repeated or missing ones of a trajectory that has points."""
     names = request.joints
     if request.count and len(joints) == 1 and names != tuple(joints):
         raise _unknown(f'is {excerpt(list(names))}: expected {list(joints)}')
@@ -150,20 +167,11 @@ def check_request(
         raise _unknown(f'has {excerpt(twice[0])} twice: expected each joint once')
     if unknown := [x for x in names if x not in joints]:
         raise _unknown(f'has {excerpt(unknown[0])}: expected names among {", ".join(joints)}')
-    if not request.count:
-        # A stop of all joints.
-        return
     missing = [x for x in joints if x not in names]
-    if not names or missing and not settings.allow_partial_joints:
+    if request.count and (not names or missing and not settings.allow_partial_joints):
         raise _unknown(
             f'lacks {missing[0]!r}: expected all of {", ".join(joints)} (set '
             'allow_partial_joints to let a message name only some of them)')
-    count = request.count * len(names)
-    if count > settings.max_points:
-        raise RefusedError(
-            Code.TOO_LONG,
-            f'the trajectory has {count} setpoints: expected at most {settings.max_points}, the '
-            'parameter max_points; send it in parts, each with its start as timestamp')
 
 
 def _unknown(reason: str) -> RefusedError:

@@ -23,8 +23,8 @@ from hmsa_ros.runtime.deviations import Deviations
 from hmsa_ros.runtime.follower import Follower, import_feedback
 from hmsa_ros.runtime.receipts import Receipts
 from hmsa_ros.runtime.records import (
+    accepted,
     by_joint,
-    check_request,
     Environment,
     Note,
     ObservedSample,
@@ -152,21 +152,15 @@ class Runtime:
             self._reporting.report()
             return self._reporting.verdict
         try:
-            check_request(
+            request = accepted(
                 request, tuple(self.group.planners), self.settings, self._clock(),
                 active=self.active)
-            if isinstance(request, Trajectory) and not request.count:
-                # As for a joint_trajectory_controller; goals are checked before.
-                request = Stop(request.name)
             if not isinstance(request, Stop):
                 if self.crowded is not None:
                     raise self.crowded
                 self.devices.check(request.joints)
         except RefusedError as error:
             return self.planning.refuse(error, request)
-        if (isinstance(request, Trajectory) and self.settings.trajectory_mode == 'rest'
-                and not request.follows):
-            request = replace(request, path=None)
         self._process_clock()
         self.devices.since = None
         if not isinstance(request, Stop):
@@ -274,7 +268,8 @@ class Runtime:
             # The timestamp is of the clock after it was set.
             self._process_clock()
             now = self._clock()
-        if joint in self.devices.apart or not self.devices.receipts.is_past(joint, stamp, now):
+        if joint in self.devices.apart or not (
+                self.devices.receipts.clock(joint).is_past(stamp, now)):
             # The clock of the device was set, and the time is unknown.
             self.deviations.newest[joint] = 0, flux_density
             if joint in self.devices.apart and self._takeover.engaged:
