@@ -7,8 +7,6 @@ from hmsa.errors import BadInputError
 from hmsa.model.thermal import checked_temperature
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.group import PlannerGroup
-from hmsa.planning.planner import Planner
-from hmsa.planning.timeline import Draft
 from hmsa_ros.runtime.planning_task import Drafts, PlanningTask, Replanning, replanning
 from hmsa_ros.runtime.records import Clock, Settings
 from hmsa_ros.timekeeping import Throttle
@@ -134,14 +132,11 @@ class Temperatures:
         begin, plan = planner.soonest(now), planner.plan
         following = plan.segments[plan.under_way(begin) + 1:][:1]
         return Replanning(
-            partial(_warmed, now=now), starts=(begin, *(x.since for x in following)))
+            lambda planner: planner.draft_warmed(now),
+            starts=(begin, *(x.since for x in following)))
 
     def take(self, work: PlanningTask, drafts: Drafts, now: int) -> None:
         """Adopt a plan made again for a time in ns; there is nothing to report."""
         for joint, draft in drafts.items():
             self._group.planners[joint].take(draft, now)
             self.followed += 1
-
-
-def _warmed(planner: Planner, now: int) -> Draft | None:
-    return planner.draft_warmed(now)
