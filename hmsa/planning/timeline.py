@@ -298,6 +298,11 @@ class PlannedSegment:
     left: Remaining | None = None
 
     @property
+    def rests(self) -> int:
+        """Planned time of rest; the start of a move whose target is only approached."""
+        return self.begin if self.arrival is None else self.arrival
+
+    @property
     def told(self) -> str:
         """How the move differs from the request, and the vibration it leaves; empty if none."""
         left = '' if self.left is None else self.left.of(self.stretch, self.code)

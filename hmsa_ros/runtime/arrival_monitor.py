@@ -277,7 +277,7 @@ class _Joint:
         """Return a setpoint as requested."""
         asked, place, last = self.asked, self.asked.kept + number, number + 1 == self.count
         segment = asked.segments[place]
-        level = asked.level(segment.begin if segment.arrival is None else segment.arrival)
+        level = asked.level(segment.rests)
         model = level.model
         omega = model.frequency(segment.stretch) / model.units.time
         ratio = model.material.zeta / critical_zeta(segment.stretch, model.material.packed)

@@ -83,7 +83,8 @@ class Stops:
             return None
         steady = self._around.steady()
         if self._rests is None:
-            if now < max(self._rest(x) for x in self._group.planners):
+            if now < max(x.plan.segments[-1].rests if x.plan.segments else ALWAYS
+                         for x in self._group.planners.values()):
                 return None
             self._rests = steady
         self._acknowledged |= {
@@ -99,14 +100,6 @@ class Stops:
             return None
         self._warned = True
         return Verdict(Severity.ERROR, Code.UNHEARD, self._missing(now, steady), self._name)
-
-    def _rest(self, joint: str) -> int:
-        """Return the planned time of rest of a joint in ns."""
-        plan = self._group.planners[joint].plan
-        if not plan.segments:
-            return ALWAYS
-        last = plan.segments[-1]
-        return last.begin if last.arrival is None else last.arrival
 
     def _acknowledges(self, joint: str, now: int) -> bool:
         """Return whether the device of a joint has acknowledged the level at a time in ns."""
