@@ -324,8 +324,8 @@ def test_usual_numbers_are_not_warned_of():
 def test_numbers_are_taken_in_the_range_that_the_nodes_take():
     needs('rclpy')
     from hmsa.interfaces.parameters import ACTUATOR
-    from hmsa_ros.nodes.planning import SPECS
-    declared = {x.name: x for x in (*ACTUATOR, *SPECS)}
+    from hmsa_ros.nodes.planning import PARAMETERS
+    declared = {x.name: x for x in (*ACTUATOR, *PARAMETERS)}
     for quantity in (*QUANTITIES, DAMPING):
         if quantity.parameter:
             spec = declared[quantity.parameter]

@@ -32,7 +32,7 @@ from hmsa_ros.nodes.duplicate_nodes import DuplicateNodes
 from hmsa_ros.nodes.managed import ManagedNode, run
 from hmsa_ros.nodes.markers import TargetMarkers
 from hmsa_ros.nodes.parameters import declare_joints
-from hmsa_ros.nodes.planning import group_from, models_from, OWN, settings_from, SPECS
+from hmsa_ros.nodes.planning import group_from, models_from, OWN, PARAMETERS, settings_from
 from hmsa_ros.runtime import records
 from hmsa_ros.runtime.runtime import Runtime
 from hmsa_ros.runtime.worker import PlanningThread
@@ -43,7 +43,6 @@ if TYPE_CHECKING:
 
 # Time in ns after which all topics of a device that runs are discovered.
 _DISCOVERY = 2 * NANOSECONDS
-PARAMETERS = SPECS
 
 # Periods of serving the runtime while work is due soon, and while none is; simulated time has any
 # pace and is read often.

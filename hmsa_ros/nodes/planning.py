@@ -80,7 +80,7 @@ OWN = (
     *shared.KNOWN,
 )
 
-SPECS = (
+PARAMETERS = (
     *OWN,
     shared.JOINT,
     JOINTS,
