@@ -434,22 +434,23 @@ class Instrument:
             raise HardwareError(f'{name} raised {described(error)}') from error
 
     def _ask(
-            self, method: str, *arguments: object, take: Callable[[Any], T],
-            wrong: Callable[[str], HardwareError]) -> T:
+            self, method: str, *arguments: object, take: Callable[[Any], T], expected: str,
+            now: int = 0) -> T:
         """Return an answer converted by `take`; its TypeError or ValueError means invalid."""
         answer = self._call(method, *arguments)
         try:
             return take(answer)
         except (TypeError, ValueError) as error:
-            raise wrong(f'{self._names[method]} returned {excerpt(answer)}') from error
+            raise HardwareError(
+                f'{self._names[method]} returned {excerpt(answer)}: expected '
+                + expected.format(now=now)) from error
 
     def write(self, level: float, now: int) -> tuple[int, float]:
         """Set a level in T at a time in ns; return its time of effect, and the actual level."""
         return self._ask(
             'write', level, self._theirs(now), take=lambda x: self._written(x, level, now),
-            wrong=lambda what: HardwareError(
-                f'{what}: expected when the level took effect in ns, near now, {now}, that and '
-                'the level really set in T, or None'))
+            expected='when the level took effect in ns, near now, {now}, that and the level '
+            'really set in T, or None', now=now)
 
     def _theirs(self, time: int) -> int:
         """Return a host time in ns on the hardware's clock."""
@@ -476,10 +477,9 @@ class Instrument:
         """Return the new readings at a time in ns."""
         return self._ask(
             'read', self._theirs(now), take=lambda x: [self._stamped(y, now) for y in readings(x)],
-            wrong=lambda what: HardwareError(
-                f'{what}: expected stretch, (stretch, rate), (stretch, rate, timestamp in ns, '
-                f'near now, {now}) or a list of the latter, at most {_MOST_PIECES} and [] if '
-                'there is none, with NaN for what is not measured'))
+            expected='stretch, (stretch, rate), (stretch, rate, timestamp in ns, near now, {now}) '
+            f'or a list of the latter, at most {_MOST_PIECES} and [] if there is none, with NaN '
+            'for what is not measured', now=now)
 
     def _stamped(self, found: Reading, now: int) -> Reading:
         if found.stamp is None:
@@ -504,8 +504,7 @@ class Instrument:
         return self._ask(
             'applied',
             take=lambda answer: [(self._happened(x, now), float(_number(y))) for x, y in answer],
-            wrong=lambda what: HardwareError(
-                f'{what}: expected a list of (timestamp in ns, level in T)'))
+            expected='a list of (timestamp in ns, level in T)')
 
     def synchronise(self, clock: Callable[[], int]) -> None:
         """Compare clocks again, if the hardware has one; ``clock`` returns the host time in ns."""
@@ -521,16 +520,14 @@ class Instrument:
             return True
         before = clock()
         answer = self._ask(
-            'clock', take=lambda x: int(_number(x)),
-            wrong=lambda what: HardwareError(f'{what}: expected its time in ns'))
+            'clock', take=lambda x: int(_number(x)), expected='its time in ns')
         return self.clock_map.add(before, answer, clock())
 
     def temperature(self) -> float:
         """Return the coil temperature in degrees Celsius; NaN if unknown."""
         return math.nan if not self.has('temperature') else self._ask(
             'temperature', take=lambda x: float(_number(x, finite=False)),
-            wrong=lambda what: HardwareError(
-                f'{what}: expected degrees Celsius, NaN if they are not known'))
+            expected='degrees Celsius, NaN if they are not known')
 
     def arm(self) -> None:
         """Prepare the hardware for levels, if it supports that."""
