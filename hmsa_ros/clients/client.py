@@ -84,15 +84,12 @@ class PlannerClient(Link):
         """Wait until a planner subscribes and its status has arrived; call ``each`` meanwhile."""
         where = self._namespace or '/'
 
-        def failure() -> str:
-            return self.no_planner
-
         def found() -> bool:
             return self.verdict is not SILENCE and self._reached()
 
         # A node that does not subscribe yet is still starting.
         self.spin_until(
-            lambda: found() or self._is_there(topics.PLANNER), failure, each,
+            lambda: found() or self._is_there(topics.PLANNER), lambda: self.no_planner, each,
             awaited=f'a planner in namespace {where}: start one with hmsa planner')
         state = ServiceCall(
             self.node, GetState, f'{topics.PLANNER}/get_state', GetState.Request())
@@ -114,7 +111,8 @@ class PlannerClient(Link):
             max(self.timeout, _LISTENS_SECONDS),
             awaited='the planner, which is starting or cannot be reached')
         state.close()
-        self.spin_until(found, failure, each, awaited='the planner to take requests')
+        self.spin_until(
+            found, lambda: self.no_planner, each, awaited='the planner to take requests')
 
     def _reached(self) -> bool:
         """Return whether a request reaches the planner, rather than only other subscribers."""
