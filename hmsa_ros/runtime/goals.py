@@ -77,6 +77,15 @@ class _Goal:
             return GoalResult('canceled', ErrorCode.SUCCESSFUL, message)
         return GoalResult('aborted', code, message)
 
+    def ended_by(self, verdict: Verdict) -> GoalResult | None:
+        """Return the result if a verdict on the goal, or on the stop that cancels it, ends it."""
+        if self.canceled and verdict.code is Code.UNHEARD:
+            return GoalResult('aborted', ErrorCode.INVALID_GOAL, verdict.message)
+        if verdict.severity is Severity.ERROR or verdict.code is Code.SUPERSEDED or (
+                self.canceled and verdict.code in (Code.STOPPED, Code.VIBRATING)):
+            return self.dropped(verdict.message, ErrorCode.of(verdict.code))
+        return None
+
 
 class Goals:
     """
@@ -153,12 +162,8 @@ class Goals:
         if answered and (goal.plan is None or goal.canceled):
             if verdict.code is Code.SUPERSEDED and goal.canceled:
                 return None
-            if goal.canceled and verdict.code in (Code.STOPPED, Code.VIBRATING):
-                return goal.dropped(verdict.message)
-            if goal.canceled and verdict.code is Code.UNHEARD:
-                return GoalResult('aborted', ErrorCode.INVALID_GOAL, verdict.message)
-            if verdict.severity is Severity.ERROR or verdict.code is Code.SUPERSEDED:
-                return goal.dropped(verdict.message, ErrorCode.of(verdict.code))
+            if (result := goal.ended_by(verdict)) is not None:
+                return result
             if not goal.canceled:
                 self._begin(name, goal)
             goal.plan = status.plan
