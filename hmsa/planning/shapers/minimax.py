@@ -11,7 +11,7 @@ linearises it in the levels, and minimises the largest length within the bounds 
 ramps.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import product
@@ -266,13 +266,34 @@ def _frame(request: MoveRequest, chain: Move, length: float) -> _Frame | None:
     return _Frame(times, last, least, most, room)
 
 
+def _slopes(vibration: Callable[[Array], Array], loads: Array, now: Array, change: float) -> Array:
+    """Return the derivatives of the vibration, ``now`` at some loads, by each of them."""
+    slopes = np.empty((*now.shape, len(loads)))
+    for i in range(len(loads)):
+        nudged = loads.copy()
+        nudged[i] += change
+        slopes[:, :, i] = (vibration(nudged) - now) / change
+    return slopes
+
+
+def _trust_region(
+        request: MoveRequest, frame: _Frame, loads: Array, stride: float) -> tuple[Array, Array]:
+    """Return the rows of what a step may change, and by how much: loads and their ramps."""
+    differences = np.eye(len(loads))
+    up, down = (np.minimum(x, stride) for x in (frame.high - loads, loads - frame.low))
+    if request.delivery.slew < math.inf:
+        differences = np.vstack([differences, differences - np.eye(len(loads), k=-1)])
+        way = np.diff(loads, prepend=request.load)
+        up, down = np.append(up, frame.room - way), np.append(down, frame.room + way)
+    return np.vstack([differences, -differences]), np.maximum(
+        np.append(up, down), _LEAST_ROOM * stride)
+
+
 def _search(
         request: MoveRequest, cases: Sequence[_ErrorCase], chain: Move,
         frame: _Frame) -> tuple[tuple[Level, ...], float]:
     """Return levels, and the largest vibration over all cases."""
-    low, high = frame.low, frame.high
-    span = float(np.max(high - low))
-
+    span = float(np.max(frame.high - frame.low))
     command: tuple[Level, ...] = ()
 
     def vibration(loads: Array) -> Array:
@@ -282,11 +303,7 @@ def _search(
 
     starts = [_reached(request, frame, x) for x in _starts(request, chain, frame)]
     now, loads = min(((vibration(x), x) for x in starts), key=lambda x: largest(x[0]))
-    stride, change = _STRIDE * span, _CHANGE * span
-    differences = np.eye(len(loads))
-    if request.delivery.slew < math.inf:
-        differences = np.vstack([differences, differences - np.eye(len(loads), k=-1)])
-    slopes = np.empty((*now.shape, len(loads)))
+    stride, slopes = _STRIDE * span, np.empty(0)
     material = request.material
     speed = float(law.natural_frequency(request.target, material.packed)) + float(
         material.branches[:, motion.SPEED].max(initial=0.0))
@@ -296,18 +313,10 @@ def _search(
         if not _NOTHING < largest(now) < math.inf:
             break
         if renew:
-            for i in range(len(loads)):
-                nudged = loads.copy()
-                nudged[i] += change
-                slopes[:, :, i] = (vibration(nudged) - now) / change
+            slopes = _slopes(vibration, loads, now, _CHANGE * span)
             if not np.all(np.isfinite(slopes)):
                 break
-        up, down = (np.minimum(x, stride) for x in (high - loads, loads - low))
-        if request.delivery.slew < math.inf:
-            way = np.diff(loads, prepend=request.load)
-            up, down = np.append(up, frame.room - way), np.append(down, frame.room + way)
-        rows = np.vstack([differences, -differences])
-        room = np.maximum(np.append(up, down), _LEAST_ROOM * stride)
+        rows, room = _trust_region(request, frame, loads, stride)
         step = least_largest(now, slopes, rows, room)
         before = largest(now)
         expected = before - largest(now + slopes @ step)
