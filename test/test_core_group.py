@@ -5,7 +5,7 @@ import math
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plants import Plant
+from plants import Plant, set_options
 import pytest
 
 from hmsa.errors import BadInputError
@@ -269,7 +269,7 @@ def test_setpoint_there_is_no_time_left_for_is_left_out():
     assert (draft.missed, [x.stretch for x in draft.segments]) == (1, [1.3])
     assert draft.segments[0].begin == START + 46 * MS
     # It would do with less of a rest at the first.
-    joint.planner.set_options(replace(joint.planner.options, short_spell='continue'))
+    set_options(joint.planner, replace(joint.planner.options, short_spell='continue'))
     draft = joint.planner.draft_resumption(START + 41 * MS)
     assert (draft.missed, [x.stretch for x in draft.segments]) == (0, [1.1, 1.3])
     joint.planner.restart()
@@ -280,7 +280,7 @@ def test_what_cannot_be_resumed_is_stopped():
     joint = Joint(lead_time=5 * MS, flux_density_min=-0.5, flux_density_max=0.5)
     joint.planner.setpoint(1.4, START)
     joint.planner.due(START + 2 * MS)
-    joint.planner.set_options(replace(joint.planner.options, flux_density_max=0.1))
+    set_options(joint.planner, replace(joint.planner.options, flux_density_max=0.1))
     found = resumed(joint.planner, START + 3 * MS)
     assert 'stretch 1.4 needs a flux density of' in found.refusal
     joint.group.resume('x', found, START + 3 * MS)
@@ -496,7 +496,7 @@ def test_other_block_is_planned_for_from_the_next_request_on():
     joint.wait(8)
     stronger = replace(joint.actuator, remanence=0.2, density=3000.0, damping_coefficient=0.1)
     plan = joint.planner.plan
-    joint.planner.set_options(joint.planner.options, stronger)
+    set_options(joint.planner, joint.planner.options, stronger)
     assert joint.planner.plan is plan
     # Up to the switch it moves as the old one, from then on as the new one.
     joint.planner.setpoint(1.4, joint.now)
@@ -518,11 +518,11 @@ def test_block_that_cannot_be_where_it_is_held_is_refused():
     planner = Planner(paper_actuator(), Options())
     planner.setpoint(1.8, START)
     with pytest.raises(BadInputError, match='the stretch that is held is 1.8'):
-        planner.set_options(planner.options, replace(paper_actuator(), chain_limit=1.0))
+        set_options(planner, planner.options, replace(paper_actuator(), chain_limit=1.0))
     assert planner.model.actuator == paper_actuator()
     for options in ({'short_spell': 'ignore'}, {'lead_time': -1}):
         with pytest.raises(BadInputError, match=next(iter(options))):
-            planner.set_options(replace(planner.options, **options))
+            set_options(planner, replace(planner.options, **options))
 
 
 def test_code_of_a_refusal_stays():

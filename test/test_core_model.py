@@ -7,6 +7,7 @@ from extras import needs
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
+from plants import acceleration_si
 import pytest
 from scipy.constants import mu_0
 
@@ -129,7 +130,7 @@ def test_acceleration_in_si_is_what_the_lagrangian_gives(derivation, states):
         stretch, rate, flux_density, BLOCK.density, BLOCK.half_length, BLOCK.half_thickness,
         BLOCK.shear_modulus, BLOCK.chain_limit, BLOCK.remanence, BLOCK.damping_coefficient,
         mu_0)
-    found = equations.acceleration_si(stretch, rate, flux_density, BLOCK)
+    found = acceleration_si(stretch, rate, flux_density, BLOCK)
     unit = BLOCK.time_unit
     close = closeness(
         found * unit ** 2, expected * unit ** 2, stretch, rate * unit, load,
@@ -141,7 +142,7 @@ def test_the_two_scalings_agree_to_rounding(states):
     stretch, rate, load = states
     material = BLOCK.nondimensional
     unit = BLOCK.time_unit
-    found = equations.acceleration_si(
+    found = acceleration_si(
         stretch, rate / unit, load * BLOCK.flux_density_unit, BLOCK) * unit ** 2
     expected = equations.acceleration(stretch, rate, load, material)
     assert np.max(closeness(found, expected, stretch, rate, load, material)) < 50 * EPS

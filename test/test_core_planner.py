@@ -6,7 +6,7 @@ import math
 from core_oracle import follow, holding_load
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plants import Plant
+from plants import Plant, set_options
 import pytest
 
 from hmsa.errors import BadInputError
@@ -311,7 +311,7 @@ def test_commands_already_sent_are_superseded_when_the_lead_time_falls():
     rig.setpoint(1.3)
     rig.wait(8)
     assert len(rig.sent) == 2
-    rig.planner.set_options(replace(rig.planner.options, lead_time=1 * MS))
+    set_options(rig.planner, replace(rig.planner.options, lead_time=1 * MS))
     rig.setpoint(1.1)
     assert rig.sent[-1].stamp < rig.sent[0].stamp
     rig.rest(30, 1.1)
@@ -534,11 +534,11 @@ def test_after_hours_of_holding_it_plans_as_after_none(zeta, hours):
 def test_options_apply_from_the_next_request_on():
     rig = Rig()
     rig.setpoint(1.1)
-    rig.planner.set_options(replace(rig.planner.options, shaper='step'))
+    set_options(rig.planner, replace(rig.planner.options, shaper='step'))
     assert rig.planner.plan.segments[-1].code is Code.TWO_STEP
     rig.rest(80, 1.1)
     assert rig.setpoint(1.2).segments[-1].code is Code.STEP
-    rig.planner.set_options(replace(rig.planner.options, flux_density_max=0.05))
+    set_options(rig.planner, replace(rig.planner.options, flux_density_max=0.05))
     refused(Code.FLUX_LIMIT, 'to 0.05 T', lambda: rig.setpoint(1.4))
 
 
@@ -549,7 +549,7 @@ def test_options_out_of_range_are_refused_and_the_old_ones_stay(options):
     planner = Planner(ACTUATOR, Options())
     old = planner.options
     with pytest.raises(BadInputError):
-        planner.set_options(replace(old, **options))
+        set_options(planner, replace(old, **options))
     assert planner.options is old
     planner.setpoint(1.1, START)
     with pytest.raises(BadInputError):

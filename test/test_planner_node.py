@@ -8,6 +8,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
+from plants import set_options
 import pytest
 from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
@@ -219,7 +220,7 @@ def test_sequence_comes_out_as_the_command_stream_of_the_core_plan(bench):
      {'flux_density_max': 0.2, 'shaper': 'minimum_time'})])
 def test_options_of_the_parameters_are_those_of_the_core_plan(bench, arguments, options):
     planner = bench(*(x for y in arguments.split() for x in ('-p', y)))
-    planner.core.set_options(replace(planner.core.options, **options))
+    set_options(planner.core, replace(planner.core.options, **options))
     planner.request(*SEQUENCE)
     planner.check(sequence=True)
     assert planner.expected[0].stamp == START + planner.core.options.lead_time
@@ -242,7 +243,7 @@ def test_minimax_takes_the_ellipsoid_of_an_identification_and_refuses_a_file_wit
     axes, values = np.array(errors.axes), [1e4, block.damping_coefficient]
     assert (axes.T @ axes)[:2, :2] == pytest.approx(
         chdtri(2, 0.05) * covariance / np.outer(values, values), rel=1e-3)
-    planner.core.set_options(replace(planner.core.options, shaper='minimax', errors=errors))
+    set_options(planner.core, replace(planner.core.options, shaper='minimax', errors=errors))
     planner.request(*SEQUENCE)
     planner.check(sequence=True)
     path.write_text(text)
@@ -455,8 +456,8 @@ def test_changed_shaper_and_limits_are_taken_from_the_next_request_on(bench):
     results = planner.ros.set_parameters('planner', [
         Parameter('shaper', value='step'), Parameter('flux_density_max', value=0.2)])
     assert [(x.successful, x.reason) for x in results] == [(True, ''), (True, '')]
-    planner.core.set_options(
-        replace(planner.core.options, shaper='step', flux_density_max=0.2))
+    set_options(
+        planner.core, replace(planner.core.options, shaper='step', flux_density_max=0.2))
     planner.run()
     assert len(planner.commands) == 6
     planner.request((1.1, SPELL))

@@ -8,6 +8,7 @@ import re
 
 from extras import needs
 import numpy as np
+from plants import acceleration_si
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
@@ -24,12 +25,7 @@ from benchmarks.robustness import tables
 from hmsa.errors import BadInputError, HmsaError
 from hmsa.model.creep import Creep
 from hmsa.model.delivery import Delivery
-from hmsa.model.equations import (
-    acceleration_si,
-    critical_zeta,
-    elastic_force,
-    natural_frequency,
-)
+from hmsa.model.equations import critical_zeta, elastic_force, natural_frequency
 from hmsa.model.moves import Level, Limits, Move
 from hmsa.model.parameters import ActuatorParameters, NondimensionalParameters, paper_actuator
 from hmsa.model.status import Code

@@ -7,13 +7,13 @@ import math
 from extras import needs
 from matplotlib.axes import Axes
 import numpy as np
+from plants import acceleration_si
 import pytest
 from scipy.integrate import solve_ivp
 import yaml
 
 from hmsa.errors import BadInputError
 from hmsa.interfaces.parameters import PLANNED
-from hmsa.model.equations import acceleration_si
 from hmsa.model.laws import LAWS
 from hmsa.model.moves import State
 from hmsa.model.parameters import ActuatorParameters

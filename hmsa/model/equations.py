@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hmsa.model import law
-from hmsa.model.parameters import ActuatorParameters, NondimensionalParameters
+from hmsa.model.parameters import NondimensionalParameters
 
 Array = NDArray[np.float64]
 #: Accepted array types: older NumPy stubs do not type the result of ``linspace`` precisely.
@@ -75,16 +75,6 @@ def acceleration(
     stretches, rates, loads = (np.array(x).ravel() for x in columns)
     law.accelerations(stretches, rates, loads, material.packed, out)
     return out.reshape(columns[0].shape)
-
-
-def acceleration_si(
-        stretch: ArrayLike, rate: ArrayLike, flux_density: ArrayLike,
-        actuator: ActuatorParameters) -> Array:
-    """Return the second derivative of the stretch in 1/s^2, Eq. 10; rate in 1/s, field in T."""
-    unit = actuator.time_unit
-    return acceleration(
-        stretch, _array(rate) * unit, _array(flux_density) / actuator.flux_density_unit,
-        actuator.nondimensional) / unit ** 2
 
 
 def energy(

@@ -72,11 +72,6 @@ class Planner(RunningPlan):
         """The model at the reference of its temperature coefficients."""
         return self.model if self.warmth is None else self.warmth.base
 
-    def set_options(
-            self, options: Options, actuator: ActuatorParameters | None = None) -> None:
-        """Plan the next requests with other options or for another block, after checks."""
-        self.take_model(self.checked_model(options, actuator or self.model.actuator))
-
     def checked_model(self, options: Options, actuator: ActuatorParameters) -> JointModel:
         """
         Return the model of options and an actuator that can hold the present position.
