@@ -154,10 +154,10 @@ def _after(
         loop: Loop, device: SimulatedDevice, planner: Planner,
         target: float) -> tuple[float, float, float]:
     """Return vibration and offset in stretch after an arrival, and the temperature."""
-    setup, now = device.setups[0], loop.now
+    setup, now = device.actuators.setups[0], loop.now
     plant = ActuatorSimulation(setup.actuator, time=now)
     plant.set_state(
-        float(device.stretch[0]), float(device.rate[0]), float(device.flux_density[0]),
+        float(device.stretch[0]), float(device.actuators.rate[0]), float(device.flux_density[0]),
         device.level(0))
     held = planner.plan.level(now + 1).flux_density
     plant.command(now, held)

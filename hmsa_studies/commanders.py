@@ -153,12 +153,12 @@ class Commander(ABC):
 
     def copy(self) -> ActuatorSimulation:
         """Return a copy of the actuator with the levels planned so far."""
-        setup, now, device = self.device.setups[0], self.now, self.device
+        setup, now, device = self.device.actuators.setups[0], self.now, self.device
         plant = ActuatorSimulation(
             setup.actuator, time=now, coil_time_constant=setup.coil_time_constant)
         plant.set_state(
-            float(device.stretch[0]), float(device.rate[0]), float(device.flux_density[0]),
-            device.level(0))
+            float(device.stretch[0]), float(device.actuators.rate[0]),
+            float(device.flux_density[0]), device.level(0))
         for stamp, level in self.levels:
             if stamp > now:
                 plant.command(stamp, level)

@@ -61,7 +61,8 @@ class SimulatedDevice(Device):
         self._cold = {i: x for i, x in enumerate(given) if x.actuator.thermal}
         self.temperatures = {i: x.actuator.thermal.ambient for i, x in self._cold.items()}
         self._warmed = time  # time in ns of these temperatures
-        self._actuators = Actuators([
+        #: Simulated actuators, with their setups and states.
+        self.actuators = Actuators([
             x.at_temperature(self.temperatures[i]) if i in self._cold else x
             for i, x in enumerate(given)], time=time)
         self._present = time  # newest time of the clock, which the simulation may lag behind
@@ -74,45 +75,35 @@ class SimulatedDevice(Device):
     @property
     def time(self) -> int:
         """Time of the state in ns."""
-        return self._actuators.time
+        return self.actuators.time
 
     @property
     def stretch(self) -> Array:
         """True stretch of each joint."""
-        return self._actuators.stretch
+        return self.actuators.stretch
 
     @property
     def coordinates(self) -> list[str]:
         """Name of the position coordinate of each joint."""
-        return [x.actuator.coordinate.name for x in self._actuators.setups]
-
-    @property
-    def rate(self) -> Array:
-        """True stretch rate of each joint in 1/s."""
-        return self._actuators.rate
+        return [x.actuator.coordinate.name for x in self.actuators.setups]
 
     def warms(self, joint: int) -> bool:
         """Return whether the coil of a joint warms it."""
         return joint in self._cold and self._cold[joint].actuator.thermal.rise > 0.0
 
     @property
-    def setups(self) -> tuple[Setup, ...]:
-        """Setup of each joint."""
-        return self._actuators.setups
-
-    @property
     def flux_density(self) -> Array:
         """Flux density on each joint in T."""
-        return self._actuators.flux_density
+        return self.actuators.flux_density
 
     def level(self, joint: int) -> float:
         """Return the last level in T that took effect on a joint."""
-        return self._actuators.schedules[joint].current
+        return self.actuators.schedules[joint].current
 
     def changes(self) -> list[Change]:
         """Return the levels that took effect since the last call."""
-        self._changes += [Change(*x) for x in self._actuators.changes]
-        self._actuators.changes.clear()
+        self._changes += [Change(*x) for x in self.actuators.changes]
+        self.actuators.changes.clear()
         return super().changes()
 
     # -- inputs --------------------------------------------------------------------------------
@@ -121,14 +112,14 @@ class SimulatedDevice(Device):
         """Apply a command in T at its timestamp in ns (0 for now), or after its delay."""
         self._check_clock(stamp)
         if self._transit.delay:
-            self._actuators.setups[joint].check_level(level)
+            self.actuators.setups[joint].check_level(level)
             self._transit.put(self.time, (joint, stamp, level))
         else:
             self._obey(joint, stamp, level)
 
     def push(self, joint: int, stamp: int, force: float) -> None:
         """Apply a force in N along the field to a joint from a timestamp in ns on, 0 for now."""
-        self._actuators.force(joint, stamp or self.time, force)
+        self.actuators.force(joint, stamp or self.time, force)
 
     def set_temperature(self, joint: int, temperature: float) -> None:
         """
@@ -137,7 +128,7 @@ class SimulatedDevice(Device):
         Raise `BadInputError` for an impossible temperature.
         """
         if joint in self._cold:
-            self._actuators.set_temperature(
+            self.actuators.set_temperature(
                 joint, self._cold[joint], checked_temperature(temperature))
             self.temperatures[joint] = temperature
 
@@ -151,15 +142,15 @@ class SimulatedDevice(Device):
                 self.temperatures[i], float(self.flux_density[i]), seconds)
             self.temperatures[i] = min(warm, HOTTEST)
             if abs(self.temperatures[i] - (
-                    self.setups[i].actuator.thermal.reference)) > _WARMER:
-                self._actuators.set_temperature(i, cold, self.temperatures[i])
+                    self.actuators.setups[i].actuator.thermal.reference)) > _WARMER:
+                self.actuators.set_temperature(i, cold, self.temperatures[i])
 
     def _obey(self, joint: int, stamp: int, level: float) -> None:
-        self._actuators.setups[joint].check_level(level)
+        self.actuators.setups[joint].check_level(level)
         guard = self.guards[joint]
         if guard.refuses(stamp, level, self.time, self.level(joint)):
             return
-        late = self._actuators.command(joint, stamp or self.time, level)
+        late = self.actuators.command(joint, stamp or self.time, level)
         came = min(stamp, self._present) if stamp else self._present
         guard.feed(max(self.time, came), stamp)
         if late:
@@ -172,7 +163,7 @@ class SimulatedDevice(Device):
         while self.next_sample <= time:
             self._run(self.next_sample)
             self.next_sample += self.period
-            actuators = self._actuators
+            actuators = self.actuators
             self._samples += self._sensor.measure(Sample(
                 actuators.time, actuators.stretch.copy(), actuators.rate,
                 actuators.flux_density))
@@ -187,14 +178,14 @@ class SimulatedDevice(Device):
         # The safe flux, where a watchdog demands it.
         for i, guard in enumerate(self.guards):
             for stamp, level in guard.watch(self.time, time, self.level(i)):
-                self._actuators.command(i, stamp, level)
+                self.actuators.command(i, stamp, level)
         self._integrate(time)
 
     def _integrate(self, time: int) -> None:
         """Advance all joints; those with an excessive load restart."""
         if self._cold:
             self._warm(time)
-        for i, reached in self._actuators.advance(time):
+        for i, reached in self.actuators.advance(time):
             self.guards[i].note(
                 Kind.FAILED, f'{too_large(reached, self.level(i))}; the joint starts again from '
                 'its initial state')
@@ -233,7 +224,7 @@ class SimulatedDevice(Device):
 
     def clock_set(self, by: int) -> None:
         """Shift all times by the ns that the clock was set ahead; the motion continues."""
-        self._actuators.clock_set(by)
+        self.actuators.clock_set(by)
         self._present += by
         self._warmed += by
         # Samples lie on a grid of the new time.
@@ -249,14 +240,14 @@ class SimulatedDevice(Device):
         for guard in self.guards:
             # Time that was not simulated does not count as silence.
             guard.pass_over(now - self.time)
-        self._actuators.time = self._warmed = now
+        self.actuators.time = self._warmed = now
         self.next_sample = -(-now // self.period) * self.period
 
     # -- restart -------------------------------------------------------------------------------
 
     def restart(self, joint: int, stretch: float | None = None, rate: float = 0.0) -> None:
         """Reset a joint to its initial or another state (rate in 1/s); time continues."""
-        self._actuators.reset(joint, stretch, rate)
+        self.actuators.reset(joint, stretch, rate)
         # The next command arms it again.
         self.guards[joint].stand_by()
         self.guards[joint].end_cut_off()
