@@ -220,11 +220,6 @@ class Deviations:
             self._report_advice()
             self.replan(name)
 
-    def _leaves(self, name: str) -> None:
-        """Mark a joint as deviating, whatever lateness is expected."""
-        self._strayed[name] = math.inf
-        self.astray.add(name)
-
     @staticmethod
     def _quarter(planner: Planner) -> int:
         """Return a quarter of a natural period in ns."""
@@ -241,7 +236,8 @@ class Deviations:
 
     def replan(self, name: str) -> None:
         """Have the rest planned anew for a joint, since its levels do not take effect."""
-        self._leaves(name)
+        self._strayed[name] = math.inf  # whatever lateness is expected
+        self.astray.add(name)
         self._unsent.add(name)
 
     def seen(self, stamp: int, *, sampled: bool = False) -> None:
