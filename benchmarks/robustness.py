@@ -26,7 +26,7 @@ from hmsa.planning.shapers import SHAPERS
 from hmsa.planning.shapers.request import MoveRequest, SmoothLimits
 from hmsa.report.looks import SCREEN
 from hmsa.table import percent
-from hmsa_studies.pictures import draw_front, draw_robustness
+from hmsa_studies.pictures import draw_front, draw_robustness, draw_sweep
 from hmsa_studies.robustness import (
     Actual,
     Candidate,
@@ -38,7 +38,6 @@ from hmsa_studies.robustness import (
     study,
 )
 from hmsa_studies.sweep import parse_grid, Sweep
-from hmsa_studies.sweep_pictures import draw_sweep
 
 MOVES = ((1.0, 1.1), (1.0, 1.4), (1.0, 0.7))
 MATERIAL = NondimensionalParameters()

@@ -24,7 +24,7 @@ from hmsa.report.figures import decimate, through, TimeCurve
 from hmsa.report.looks import case, CASES, KINDS, LineStyle, named, Paper, SHAPERS
 from hmsa.report.picture import draw, draw_bands
 from hmsa.table import percent
-from hmsa_studies.sweep_pictures import label_of, worded
+from hmsa_studies.pictures import label_of, worded
 
 # What deuteranopia and protanopia leave of linear red, green and blue (Machado and others, IEEE
 # Transactions on Visualization and Computer Graphics 15, 2009, full severity).

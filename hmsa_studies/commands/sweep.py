@@ -152,7 +152,7 @@ class _SweepPicture:
         written = [*self._paths, *self._tables]
         if not changed and self._default and all(x.exists() for x in written):
             return written
-        from hmsa_studies.sweep_pictures import draw_sweep
+        from hmsa_studies.pictures import draw_sweep
 
         draw_sweep(self._paths, self._view, self._columns, self._sweep.fixed, self._paper)
         return written
