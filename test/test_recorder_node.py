@@ -482,6 +482,22 @@ def test_a_clock_that_is_set_back_begins_a_file_whose_log_times_rise(
     assert first.log_time - second.log_time > 9 * NANOSECONDS
 
 
+def test_a_clock_that_is_set_ahead_is_told_in_the_bag(ros, serve, tmp_path, capfd):
+    recorder = serve(Recording, *in_process(tmp_path / 'bag')).nodes[0]
+    publisher = ros.publisher(Float64, '/a')
+    send(publisher, 1.0)
+    ros.spin_until(lambda: recorder._recorded.topics['/a'].received == 1, 'the first message')
+    recorder._steps._clock = lambda: time.time_ns() + 3600 * NANOSECONDS
+    send(publisher, 2.0)
+    ros.spin_until(lambda: recorder._recorded.topics['/a'].received == 2, 'the second message')
+    recorder.close()
+    reader = BagReader(tmp_path / 'bag')
+    assert reader.custom_data['time_set_ahead'].startswith('3600.0')
+    assert 'time_jumps' not in reader.custom_data
+    assert len(reader.files) == 1
+    assert 'the clock of this host was set ahead by 3600.0' in capfd.readouterr().err
+
+
 def test_what_comes_while_messages_are_taken_is_in_the_file_of_its_time(
         ros, serve, tmp_path, monkeypatch):
     folder = tmp_path / 'bag'

@@ -270,7 +270,7 @@ class Recorder(ManagedNode):
         # While inactive, it is paused anyway.
         self._paused: bool = values['record.start_paused']
         self._sim_time = SimulatedTime() if self.simulated else None
-        self._steps, self._set_back = StepWatch(), 0
+        self._steps, self._set_back, self._ahead = StepWatch(), 0, 0
         self._experiment: dict[str, str] = {'hmsa_ros.version': __version__}
         # Number of topics with a publisher at the last look, and of nodes whose parameters are
         # stored.
@@ -355,8 +355,14 @@ class Recorder(ManagedNode):
 
     def _follow_wall(
             self, taken: Sequence[tuple[Any, list[Taken]]]) -> list[tuple[Any, list[Taken]]]:
-        """Record messages from before the clock was set back."""
+        """Report a clock that is set, and record messages from before it was set back."""
         now, by = self._steps.read()
+        if by > 0:
+            self._ahead += by
+            self.get_logger().warning(
+                f'the clock of this host was set ahead by {by / NANOSECONDS:.3f} s: nothing was '
+                'recorded in the time that the bag shows there')
+            self._note({'time_set_ahead': f'{self._ahead / NANOSECONDS:.3f} s'})
         if by >= 0:
             return [*taken]
         earlier, rest = _parted(taken, partial(lt, now))
