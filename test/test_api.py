@@ -220,6 +220,19 @@ def test_what_is_identified_plans_and_is_written_with_its_covariance(tmp_path):
         [(1.1, 1.0)], 'minimax').segments[0].move.duration * 1.5
 
 
+def test_what_only_counts_together_is_written_too(tmp_path):
+    # Moves without vibration and noise show the ratio of modulus and remanence, and no more.
+    block = hmsa.Actuator()
+    motion = block.simulate(block.plan([(1.1, 0.1), (1.3, 0.1), (0.9, 0.1), (1.2, 0.1)]))
+    table = tmp_path / 'samples.csv'
+    rows = zip(motion.times[::2], motion.stretches[::2], motion.flux_densities[::2], strict=True)
+    table.write_text('time,stretch,flux_density\n' + ''.join(
+        f'{x:.6f},{y:.7f},{z:.7f}\n' for x, y, z in rows))
+    found = hmsa.identify(table)
+    found.to_yaml(tmp_path / 'found.yaml')
+    assert hmsa.Actuator.from_yaml(tmp_path / 'found.yaml') == found.actuator
+
+
 def test_a_fit_without_meaning_is_rejected_as_the_command_does():
     motion = hmsa.Actuator(shear_modulus=30e3, half_length=5e-3, remanence=0.08).simulate(
         [(0.0, 0.0), (0.02, 0.1), (0.06, -0.1), (0.1, 0.05), (0.15, 0.0)], until=0.2, noise=1e-4)

@@ -231,7 +231,7 @@ def file_text(found: 'Identification', belief: Belief, run: str, now: datetime) 
         if not key.startswith(PREFIX):
             written.setdefault(key, _line(key, value, found))
     # Undetermined parameters have no covariance.
-    lines += [*written.values(), *known_lines(Known(
+    lines += [*written.values(), *known_lines(Known.of(
         found.names, tuple(float(found.values[x]) for x in found.names), found.covariance)
         if np.all(np.isfinite(found.covariance)) else Known())]
     return '\n'.join(lines) + '\n'

@@ -24,8 +24,8 @@ from hmsa.model.thermal import COLDEST, HOTTEST, Thermal
 
 #: Prefix in parameter files.
 PREFIX = 'identification.'
-# Minimum eigenvalue of the correlation matrix.
-_SINGULAR = 1e-12
+# Minimum eigenvalue of the correlation matrix, and the one that is written.
+_SINGULAR, _REGULAR = 1e-12, 1e-11
 
 
 @dataclass(frozen=True)
@@ -430,6 +430,16 @@ class Known:
             raise BadInputError(
                 f'{PREFIX}covariance is not a covariance matrix: expected a symmetric one with '
                 'positive eigenvalues, row after row')
+
+    @classmethod
+    def of(cls, names: tuple[str, ...], values: tuple[float, ...], covariance: Array) -> 'Known':
+        """
+        Return what a fit found, also if only combinations of its parameters are determined.
+
+        Their correlation matrix is singular up to rounding. Standard deviations are not changed.
+        """
+        own = np.diag(np.diag(covariance))
+        return cls(names, values, (1.0 - _REGULAR) * covariance + _REGULAR * own)
 
     @classmethod
     def read(cls, settings: Mapping[str, Any]) -> 'Known':
