@@ -104,6 +104,7 @@ class AdaptiveJoint:
     auditing: Iterator[None] | None = None  # the audit under way
     lost: str = ''  # why the field is not as commanded; empty if it is
     largest: float = math.inf  # level in T at which the amplifier saturated
+    _took_effect: tuple[int, int] = 0, 0  # timestamps of the last two applied levels
     news: bool = False  # whether the latest estimate awaits comparison with the plan
     # Samples that arrived during an update: timestamp, stretch, and time of arrival.
     _waiting: list[tuple[int, float, int]] = field(default_factory=list)
@@ -249,6 +250,7 @@ class AdaptiveJoint:
 
     def applied(self, stamp: int, flux_density: float) -> None:
         """Record that a level in T has taken effect, before the plan does."""
+        self._took_effect = self._took_effect[1], stamp
         plan = self.planner.plan
         place = plan.place(stamp)
         wanted, *early = (x.flux_density for x in plan.levels[place:place + 2])
@@ -291,7 +293,8 @@ class AdaptiveJoint:
         plan = self.planner.plan
         first = max(plan.place(self.estimator.since) - _BEFORE, 0)
         self.estimator.set_levels([
-            (x.stamp, x.flux_density) for x in plan.levels[first:plan.place(until) + 1]])
+            (x.stamp, x.flux_density) for x in plan.levels[first:plan.place(until) + 1]],
+            self._took_effect)
 
     def update(self, now: int, doing: Doing) -> Awaited[None]:
         """Update the estimate with new samples, and predict the state at a time."""

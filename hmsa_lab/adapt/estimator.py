@@ -216,10 +216,16 @@ class Estimator:
         window = self._window
         return 0 if window is None else int(np.sum(window.time >= self._seconds(stamp)))
 
-    def set_levels(self, levels: Sequence[tuple[int, float]]) -> None:
-        """Set all levels from a time on (timestamp in ns, T); earlier ones stay."""
-        first = levels[0][0]
-        self._levels = [x for x in self._levels if x[0] < first] + list(levels)
+    def set_levels(
+            self, levels: Sequence[tuple[int, float]], void: tuple[int, int] = (0, 0)) -> None:
+        """
+        Set all levels from a time on (timestamp in ns, T).
+
+        Earlier ones stay, but for those between the times ``void``, which never took effect.
+        """
+        first, (begin, end) = levels[0][0], void
+        self._levels = [
+            x for x in self._levels if x[0] < first and not begin < x[0] < end] + list(levels)
 
     def sample(self, stamp: int, stretch: float) -> bool:
         """Add a stretch measured at a timestamp in ns; return whether it can be used."""
