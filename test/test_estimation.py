@@ -8,6 +8,7 @@ import pytest
 
 from hmsa.errors import BadInputError
 from hmsa.identification.files import read_belief
+from hmsa.identification.quantities import Known
 from hmsa.model.creep import Creep
 from hmsa.motion import subset_inverses, subsets
 from hmsa.planning.planner import Options as PlannerOptions
@@ -383,3 +384,26 @@ def test_the_systems_of_subsets_are_solved_as_by_numpy():
         subsets(matrix, varies, found[:39], log_det)
     with pytest.raises(ValueError, match='fit each other'):
         subset_inverses(matrix, varies, weights, total[:6])
+
+
+@pytest.mark.parametrize('stretch', [1.1, pytest.param(1.4, marks=pytest.mark.slow)])
+def test_a_changed_sensor_without_noise_is_known_to_within_a_variance_at_rest(stretch):
+    estimator = Estimator(Prior.of_changed_sensor(
+        oracle.BLOCK, ('shear_modulus', 'damping_coefficient', 'stretch_bias'), Known(), others={},
+        bias=(0.0, 1e-4)))
+    estimator.set_levels([(0, oracle.level_of(stretch))])
+    for stamp in range(0, 1_200_000_000, 20_000_000):
+        for i in range(10):
+            estimator.sample(stamp + i * 2_000_000, stretch + 0.02)
+        found = estimator.update(stamp + 20_000_000)
+        assert found.trusted
+        assert np.all(np.diag(found.covariance) >= 0.0)
+    assert found.stretch == pytest.approx(stretch, abs=1e-6)
+
+
+def test_levels_that_never_took_effect_are_forgotten():
+    estimator = Estimator(Prior.nominal(oracle.BLOCK))
+    estimator.set_levels([(0, 0.0), (ns(0.1), 0.07)])
+    # The plan that has the next one begins later.
+    estimator.set_levels([(ns(0.3), 0.05)], (0, ns(0.3)))
+    assert estimator.predict(ns(0.2)).stretch == pytest.approx(1.0, abs=1e-9)

@@ -267,7 +267,7 @@ class Estimator:
         window.settle(z, _AT_REST)
         here = self._take(window, levels, until)
         found = window.solve(z, levels, self.noise, until, here)
-        if found is None:
+        if found is None or np.any(np.diag(found.covariance) < 0.0):
             self.screening.trouble = 'no motion leads through the samples'
             return None
         self._solution = found

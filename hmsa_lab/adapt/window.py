@@ -173,21 +173,25 @@ class Window:
 
         Far from them a force would shift it differently, which would look like an observation.
         """
-        if self.rest is not None:
-            self._rest(self.rest, z, off)
-        self.information = np.asarray(np.linalg.inv(self.covariance), dtype=np.float64)
+        if self.rest is None or not self._rest(self.rest, z, off):
+            self.information = np.asarray(np.linalg.inv(self.covariance), dtype=np.float64)
 
-    def _rest(self, known: Rest, z: Array, off: float) -> None:
-        """Start at an equilibrium."""
+    def _rest(self, known: Rest, z: Array, off: float) -> bool:
+        """Start at an equilibrium; return whether there is one."""
         values = self.values_at(z)
         at = rest(values, self.free, known.level)
         if at is None:
-            return
+            return False
         tie = np.vstack([np.eye(len(z) - 2), at[2], np.zeros(len(z) - 2)])
         there = np.append(z[:-2], [at[0], 0.0])
         self.mean = there + tie @ (known.mean - z[:-2])
         self.covariance = tie @ known.covariance @ tie.T
         self.covariance[[-2, -1], [-2, -1]] += np.square([off, off * at[1]])
+        # Its inverse would not be positive definite, since the state hardly varies for itself.
+        apart = np.eye(len(z))[-2:]
+        apart[0, :-2] = -at[2]
+        self.information = apart.T @ (apart / np.square([[off], [off * at[1]]]))
+        self.information[:-2, :-2] += np.linalg.inv(known.covariance)
         if known.weight > 0.0:
             state = np.zeros((1, len(z)))
             state[0, -2] = gain_of(values)
@@ -197,6 +201,8 @@ class Window:
             share = pull / (by @ pull + 1.0 / known.weight)
             self.mean += share * (known.shown - float(shown[0]) - by @ (self.mean - there))
             self.covariance -= np.outer(share, pull)
+            self.information += known.weight * np.outer(by, by)
+        return True
 
     def rest_on(
             self, at: Rest, count: int, begin: float, here: Simulation, noise: float,
