@@ -340,6 +340,17 @@ def test_what_a_sensor_showed_that_failed_in_the_first_move_ends_with_it(change,
         it.runtime.follower.joints['a'].given.actuator.remanence, rel=1e-3)
 
 
+def test_the_noise_of_a_sensor_that_repeated_a_value_is_not_kept():
+    it = bench(False, noise=3e-4, factors={'shear_modulus': 1.1})
+    moves(it, (1.3, 1.15))
+    healthy, it.sense = it.sense, lambda time, x: [(time, min(x, 1.2))]
+    moves(it, (1.35,))
+    it.sense = healthy
+    assert np.max(np.abs(moves(it, (1.25, 1.4)))) < 0.1
+    # With the noise of the repeated value, no explanation of healthy samples would last.
+    assert it.estimates[-1].values['new_beginnings'] <= 3
+
+
 def test_a_saturated_amplifier_does_not_end_feedback():
     it = bench(False, noise=3e-4, factors={'shear_modulus': 1.1})
     moves(it, (1.37, 1.11))

@@ -170,22 +170,14 @@ class Estimator:
     """Estimator of one actuator."""
 
     def __init__(self, prior: Prior, options: EstimatorOptions | None = None) -> None:
-        self.prior = prior
         self.options = options or EstimatorOptions()
-        self.noise = self.options.noise or _FIRST_NOISE
         self.screening = Screening(self.options.gate, prior.coordinate)
         # If False, parameters stay fixed from the next update on.
         self.learning = self.options.learn
-        # Covariance of the parameters while they are fixed.
-        self._fixed: Array | None = None
-        self._settled = True  # whether a window may begin at equilibrium
         self.unmeasured = True  # whether the temperature may change without a measurement
-        self._warmed = 0.0  # change of the measured temperature in K since the window began
         self._levels: list[tuple[int, float]] = []
-        self._pending: list[tuple[int, float]] = []
         self._origin = 0
-        self._window: Window | None = None
-        self._solution: Solution | None = None
+        self.restart(prior)
 
     def restart(self, prior: Prior, *, settled: bool = True) -> None:
         """
@@ -194,10 +186,15 @@ class Estimator:
         Unless ``settled``, a block that has rested need not be at the equilibrium of its level.
         """
         self.prior, self._settled = prior, settled
+        # That of a sensor which repeats a value would be none.
+        self.noise = self.options.noise or _FIRST_NOISE
         self.screening.restart()
-        self._pending.clear()
-        self._fixed = self._window = self._solution = None
-        self._warmed = 0.0
+        self._pending: list[tuple[int, float]] = []
+        self._window: Window | None = None
+        self._solution: Solution | None = None
+        # Covariance of the parameters while they are fixed.
+        self._fixed: Array | None = None
+        self._warmed = 0.0  # change of the measured temperature in K since the window began
 
     @property
     def since(self) -> int:
