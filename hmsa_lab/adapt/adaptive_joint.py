@@ -328,7 +328,7 @@ class AdaptiveJoint:
         if lacks and trust.acts:
             trust.wait(now)
         self._anew &= found is None
-        acted = trust.acts
+        acted = trust.acts or trust.ended
         if found is not None and not (trouble or lacks):
             trust.fits(plan, self._pace, estimator, now, waits=now < self.waits)
         if trouble and trust.doubt(

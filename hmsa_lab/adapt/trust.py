@@ -49,16 +49,17 @@ class Trust:
 
         An estimate that earlier samples ``fitted`` has failed, or one that plans ``used``.
         """
-        if self.ended:
-            return False
-        self.why = why
         self._doubts += 1
+        persists = self._doubts >= _PERSISTENT or at_once
+        if persists or not self.ended:
+            self.why = why
         # The first samples of a motion, which are few, may not fit yet.
-        if (self.acts or not self.beginnings) and self._doubts < _PERSISTENT and not at_once:
+        if (self.acts or self.ended or not self.beginnings) and not persists:
             return False
         self._failed |= fitted or self.acts and used
         self.beginnings += 1
-        self.acts, self.begin, self._doubts = False, now, 0
+        # What has ended feedback may have changed, too.
+        self.acts, self.ended, self.begin, self._doubts = False, False, now, 0
         return True
 
     def fits(
