@@ -193,8 +193,9 @@ def test_garbage_on_its_topics_neither_ends_nor_misleads_it(ros, ros_env, wait_u
 
 @pytest.mark.ros
 def test_lines_follow_a_real_run_until_a_signal(start, wait_until):
-    start.hmsa('plant')
-    start.hmsa('planner')
+    # In slow motion, whose time stands still with the plant on a busy machine.
+    start.hmsa('plant', '--ros-args', '-p', 'publish_clock:=true', '-p', 'real_time_factor:=0.1')
+    start.hmsa('planner', '--ros-args', '-p', 'use_sim_time:=true', '-p', 'lead_time:=0.1')
     lines, objects = start.hmsa('watch'), start.hmsa('watch', '--json')
     lines.wait_for_output('actuator 1.00000')
     lines.wait_for_output('no request yet')
