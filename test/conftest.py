@@ -15,6 +15,7 @@ from pathlib import Path
 import re
 import shlex
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -263,7 +264,7 @@ def refusal(command: Callable[..., tuple[int, str, str]]) -> Callable[..., str]:
 
 @contextmanager
 def own_domain() -> Iterator[int]:
-    """Reserve a domain id that no other test on this machine uses at the same time."""
+    """Reserve a domain id that nobody else on this machine uses."""
     folder = Path(tempfile.gettempdir()) / f'hmsa_ros_domains_{os.getuid()}'
     folder.mkdir(exist_ok=True)
     # In sequence, so that late packets of an ended test have no receiver; starting at a random
@@ -274,6 +275,9 @@ def own_domain() -> Iterator[int]:
         with (folder / str(domain)).open('w') as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                # Nodes that no test started: the port on which the first one of DDS listens.
+                with socket.socket(type=socket.SOCK_DGRAM) as probe:
+                    probe.bind(('', 7410 + 250 * domain))
             except OSError:
                 continue
             yield domain
