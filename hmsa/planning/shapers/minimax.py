@@ -276,17 +276,13 @@ def _slopes(vibration: Callable[[Array], Array], loads: Array, now: Array, chang
     return slopes
 
 
-def _trust_region(
-        request: MoveRequest, frame: _Frame, loads: Array, stride: float) -> tuple[Array, Array]:
-    """Return the rows of what a step may change, and by how much: loads and their ramps."""
-    differences = np.eye(len(loads))
+def _room(request: MoveRequest, frame: _Frame, loads: Array, stride: float) -> Array:
+    """Return by how much loads, and their ramps if limited, may rise in a step, and fall."""
     up, down = (np.minimum(x, stride) for x in (frame.high - loads, loads - frame.low))
     if request.delivery.slew < math.inf:
-        differences = np.vstack([differences, differences - np.eye(len(loads), k=-1)])
         way = np.diff(loads, prepend=request.load)
         up, down = np.append(up, frame.room - way), np.append(down, frame.room + way)
-    return np.vstack([differences, -differences]), np.maximum(
-        np.append(up, down), _LEAST_ROOM * stride)
+    return np.maximum(np.append(up, down), _LEAST_ROOM * stride)
 
 
 def _search(
@@ -304,6 +300,10 @@ def _search(
     starts = [_reached(request, frame, x) for x in _starts(request, chain, frame)]
     now, loads = min(((vibration(x), x) for x in starts), key=lambda x: largest(x[0]))
     stride, slopes = _STRIDE * span, np.empty(0)
+    rows = np.eye(len(loads))
+    if request.delivery.slew < math.inf:
+        rows = np.vstack([rows, rows - np.eye(len(loads), k=-1)])
+    rows = np.vstack([rows, -rows])
     material = request.material
     speed = float(law.natural_frequency(request.target, material.packed)) + float(
         material.branches[:, motion.SPEED].max(initial=0.0))
@@ -316,7 +316,7 @@ def _search(
             slopes = _slopes(vibration, loads, now, _CHANGE * span)
             if not np.all(np.isfinite(slopes)):
                 break
-        rows, room = _trust_region(request, frame, loads, stride)
+        room = _room(request, frame, loads, stride)
         step = least_largest(now, slopes, rows, room)
         before = largest(now)
         expected = before - largest(now + slopes @ step)
