@@ -118,6 +118,19 @@ def test_a_client_that_waits_in_vain_says_what_it_knows_and_how_to_stop_the_requ
         assert f'{known} status: setpoint 1 of 1, ' in str(caught.value)
 
 
+@pytest.mark.ros
+def test_a_second_planner_is_not_taken_for_a_newer_request(ros_env, serve, start):
+    serve(PlannerNode)
+    with PlannerClient() as client:
+        client.find_planner()
+        verdict = client.send_sequence([(1.1, 60.0)])
+        start.hmsa(*PLANNER)
+        with pytest.raises(HmsaError, match=(
+                'ended early: the planner in namespace / was restarted, or a second one answers '
+                r'\(no request yet\): expected one until the end')):
+            client.follow(verdict, timeout=20.0)
+
+
 @pytest.mark.slow
 @pytest.mark.ros
 def test_ctrl_c_of_a_sequence_that_is_waited_for_stops_it(start):

@@ -360,9 +360,7 @@ class PlannerClient(Link):
         def done() -> bool:
             now = self.verdict
             if now.plan != verdict.plan:
-                raise HmsaError(
-                    'the sequence ended early: a newer request arrived, for its joints or for '
-                    f'others ({now.message})')
+                raise HmsaError(f'the sequence ended early: {self.instead_of(verdict)}')
             nonlocal heard
             ended = (
                 now.setpoint == now.setpoints and now.state in ('at_rest', 'settling')

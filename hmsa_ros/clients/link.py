@@ -84,6 +84,16 @@ class Link(TemporaryNode):
         return sorted(x for name, x in self.node.get_node_names_and_namespaces()
                       if name == topics.PLANNER and x != self.node.get_namespace())
 
+    def instead_of(self, verdict: StatusVerdict) -> str:
+        """Return what the planner carries out instead of the plan of a verdict, in words."""
+        if self.verdict.plan < verdict.plan:  # which it counts
+            return (
+                f'{self.planner} was restarted, or a second one answers ({self.verdict.message}): '
+                'expected one until the end')
+        return (
+            'a newer request arrived, for its joints or for others '
+            f'({self.verdict.message})')
+
     def publish_stop(self, name: str) -> None:
         """Send a stop of a name."""
         self._publisher.publish(JointTrajectory(header=Header(frame_id=name)))
@@ -196,9 +206,7 @@ class Stopping:
                 '' if verdict.code in _KNOWN else
                 '; plant or driver has not acknowledged the stop: switch the coil off there')
         elif link.verdict.plan != verdict.plan:
-            self.failure = (
-                'the stop was sent, but a newer request came, for its joints or others '
-                f'({link.verdict.message})')
+            self.failure = f'the stop was sent, but {link.instead_of(verdict)}'
         elif passed > _STOP_SECONDS:
             self.failure = (
                 f'the planner has not come to rest ({link.verdict.state}: {verdict.message}): '
