@@ -237,6 +237,16 @@ def test_close_modes_that_change_with_the_stretch_are_no_single_one_of_more_damp
     assert [x.share[0] for x in found.modes] == pytest.approx([0.12, 0.12], rel=0.15)
 
 
+def test_a_mode_too_fast_for_a_strong_one_has_the_damping_of_all_weak_ones():
+    true = replace(BLOCK, modes=Modes((1.4, 8.0), (0.2, 0.1), (0.1, 0.6)))
+    begin = fit(
+        recorded(true, count=2), {**values_of(true), 'modes.damping_ratio.2': 0.3},
+        ('mass_factor', 'modes.share.2'))
+    values = modal._viscous(begin).values
+    assert values['modes.damping_ratio.2'] == 0.6
+    assert values['modes.damping_ratio'] == pytest.approx(1.4 * modal._damping_ratio(values))
+
+
 @pytest.mark.parametrize('shares', [0.0, 0.95])
 def test_what_was_not_asked_for_is_not_free_where_the_modes_hide_it(monkeypatch, shares):
     # As on finite elements of a flat block, where each coordinate improves the fit.

@@ -42,6 +42,7 @@ from hmsa.identification.result import Defect, Identification, IdentificationVer
 from hmsa.identification.search import rivals, search, unmoved
 from hmsa.interfaces.actuator import along_elastica, parameters_of
 from hmsa.model.equations import Array
+from hmsa.model.modes import BROAD
 from hmsa.model.parameters import ActuatorParameters, paper_actuator
 from hmsa.table import RESOLVED
 
@@ -188,8 +189,11 @@ def _with_modes(
 
     best = narrower(one, start, together, limit, actuator.modes.numbers)
     found = concluded(best)
-    # J_lim, and what nobody asked for, keep their values where errors of the modes hide them.
-    usual = {'chain_limit': limit} | {x: y for x, (y, _) in BESIDES.items() if x not in free}
+    # J_lim, what nobody asked for, and where a broad mode is keep their values where errors of the
+    # modes hide them.
+    usual = {'chain_limit': limit} | {x: y for x, (y, _) in BESIDES.items() if x not in free} | {
+        x[0]: best.values[x[0]] for x in quantities.modes_of(best.values)
+        if best.values[x[2]] >= BROAD}
     while found.verdict == 'not_identifiable' and (hidden := {
             x: y for x, y in usual.items()
             if x in best.free and math.isnan(found.parameters[x].value)}):
