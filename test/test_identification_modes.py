@@ -3,6 +3,7 @@
 from dataclasses import replace
 from datetime import datetime
 import json
+import math
 import sys
 
 import numpy as np
@@ -12,7 +13,7 @@ from scipy.integrate import solve_ivp
 from benchmarks.block_elements import Block
 from hmsa.cli import main
 from hmsa.identification import modal
-from hmsa.identification.diagnosis import cost, misfit, unexplained
+from hmsa.identification.diagnosis import cost, frequency_of, misfit, unexplained
 from hmsa.identification.excitation import Bounds, excite
 from hmsa.identification.files import file_text, read_belief
 from hmsa.identification.fit import fit, whiteness
@@ -345,15 +346,20 @@ def test_what_a_mode_explains_as_well_as_freed_parameters_is_not_identifiable():
     assert '--free +modes' in found.reason
 
 
+def _block(known, cells) -> Block:
+    material = known.nondimensional
+    return Block(
+        known.half_thickness / known.half_length, material.j_lim,
+        material.zeta * material.c1 / 6.0, cells)
+
+
 def _elements(known, cells) -> Measurement:
     """Return a recording of coarse finite elements."""
     material, unit, dwell = known.nondimensional, known.time_unit, 8.0 * known.period
     times = np.append(0.0, 0.02 + dwell * np.arange(6))
     levels = known.flux_density_unit * np.append(0.0, elastic_force(
         np.resize(TARGETS, 6), material))
-    block = Block(
-        known.half_thickness / known.half_length, material.j_lim,
-        material.zeta * material.c1 / 6.0, cells)
+    block = _block(known, cells)
     end = float(times[-1] + dwell)
     moved, stretch = block.follow([*zip(
         np.diff(np.append(times, end)) / unit, (levels / known.flux_density_unit).tolist(),
@@ -381,6 +387,12 @@ def test_finite_elements_are_rejected_for_a_second_mode_and_identified_with_it()
     assert found.parameters['remanence'].value == pytest.approx(BLOCK.remanence, rel=0.03)
     assert abs(found.parameters['stretch_bias'].value) < 3.0 * found.parameters['stretch_bias'].std
     assert any('modes leave' in x for x in found.warnings)
+    # Residuals do not show that a continuum has another frequency at large amplitudes.
+    frequencies, shares = _block(known, (3, 3, 2)).modes()
+    true = frequencies[np.argmax(shares)] / (2.0 * math.pi * known.time_unit)
+    factor = found.parameters['mass_factor']
+    assert factor.low < factor.value * (frequency_of(found.fit) / true) ** 2 < factor.high
+    assert 0.02 < (factor.high - factor.low) / factor.value < 0.06
 
 
 @pytest.mark.slow

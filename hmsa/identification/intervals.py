@@ -1,6 +1,6 @@
 """Precision of the parameters: covariance, intervals, profiles."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 import math
 
@@ -20,6 +20,7 @@ from hmsa.identification.fit import (
     widening,
 )
 from hmsa.identification.initial_guess import changes_of
+from hmsa.identification.modal import BESIDES
 from hmsa.identification.response import respond
 from hmsa.identification.result import Estimate, Identification
 from hmsa.model.equations import Array
@@ -29,6 +30,12 @@ _NEARLY_LOST = 0.3
 # Quantiles of the stretch between which errors of a continuum's model count as one draw: with
 # more parts, intervals missed the first frequency of finite elements more often.
 _PARTS = 1.0 / 3.0, 2.0 / 3.0
+# Standard deviation of the relative change of a continuum's first frequency with the amplitude
+# beyond that of the model, over its square: 0 to 1 on finite elements, free and glued.
+_BEYOND = 0.4
+# Fraction of a derivative below which the free parameters explain all of it; J_lim in place of an
+# infinite one.
+_HIDDEN, _LOOSE = 1e-10, 1e9
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,9 +75,10 @@ def precision_of(best: Fit, variance: Array, given: Mapping[str, float | None]) 
                                for x in (changes_of(best.recording), np.digitize(
                                    shown, np.quantile(shown, _PARTS))))
         factors = np.maximum(correlated, math.sqrt(len(_PARTS) + 1.0) * similar)
+        moves = _of_forms(best, columns, inverse, given)
         return Precision(
             deviation, freedom, found, inverse, correlated, correlated,
-            inverse * deviation ** 2 * np.outer(factors, factors), missing)
+            inverse * deviation ** 2 * np.outer(factors, factors) + moves.T @ moves, missing)
     variance = variance + _blurred(best, deviation, columns, inverse)
     proved, factors = (
         correlated * np.sqrt(np.maximum(x / np.diag(inverse) / deviation ** 2, 1.0))
@@ -87,6 +95,44 @@ def stamp_error(best: Fit, deviation: float) -> float:
     place = int(np.argmax(best.spread))
     return deviation * math.sqrt(float(best.spread[place]) ** 2 - 1.0) / max(
         abs(float(best.response.rate[place])), 1e-300)
+
+
+def _of_forms(
+        best: Fit, columns: Array, inverse: Array, given: Collection[str]) -> Array:
+    """
+    Return changes of the coordinates by one standard deviation of errors of form, shape (k, p).
+
+    Residuals do not show these errors of a block with modes, as other parameters compensate.
+    J_lim, and how inertia and damping change with the stretch, have usual values where the
+    recording hardly shows them: the change is that to their optimum. The first frequency changes
+    with the amplitude otherwise than in uniform deformation, and those of other modes do not.
+    """
+    values, law = best.values, best.values['law']
+    if law is not None and law.section:
+        return np.empty((0, len(best.free)))
+    kept = [x for x in ('chain_limit', *BESIDES) if x not in best.free and x not in given
+            and not (x == 'chain_limit' and law is not None)]
+    response = respond(best.recording, {
+        **values, 'chain_limit': min(values['chain_limit'], _LOOSE)}, ('mass_factor', *kept))
+    if response is None:
+        return np.empty((0, len(best.free)))
+    added = best.root[:, None] * response.jacobian
+    ways = inverse @ (columns.T @ added)
+    shown = added - columns @ ways
+    norms = np.sum(shown ** 2, axis=0)
+    sizes = np.divide(
+        shown.T @ (best.root * best.residual), norms, out=np.zeros(len(norms)),
+        where=norms > _HIDDEN * np.sum(added ** 2, axis=0))
+    moves: Array = -(ways * sizes).T
+    # Where in the motion the frequency is determined, the amplitude is that of the speed.
+    weights = (columns @ (inverse @ ways[:, 0])) ** 2
+    speed = best.response.rate / (2.0 * math.pi * diagnosis.frequency_of(best))
+    change = _BEYOND * 2.0 * float(np.average(speed ** 2, weights=weights))
+    moves[0] = 2.0 * change * ways[:, 0]
+    for names in quantities.modes_of(values):
+        if names[0] in best.free:
+            moves[0, best.free.index(names[0])] += change
+    return moves
 
 
 def _blurred(best: Fit, deviation: float, columns: Array, inverse: Array) -> Array:
