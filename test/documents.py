@@ -555,6 +555,28 @@ def _check_hmsa(words: list[str]) -> None:
         _check_parameters(words[0], words)
 
 
+def check_named(text: str) -> None:
+    """Require that the commands and options that the text of a page names exist."""
+    from hmsa.cli import build_parser
+    from hmsa.cli.completion import commands_of
+
+    known = {x.path: {name for y in x.options for name in y.names}
+             for x in commands_of(build_parser())}
+    # Blocks are checked on their own.
+    for code in re.findall(r'`([^`]+)`', re.sub(
+            r'^ *(`{3,}).*?^ *\1 *$', '', text, flags=re.M | re.S)):
+        program, *words = code.split() or ['']
+        if program != 'hmsa' or not words:
+            continue
+        path = next((x for x in (' '.join(words[:2]), words[0]) if x in known), '')
+        inner = [x for x in known if x.startswith(f'{path} ')]
+        _require(path and not (inner and words[1:]), f'hmsa has no command of {code!r}')
+        # What follows is for ROS.
+        options = words[:words.index('--ros-args')] if '--ros-args' in words else words
+        for option in (x.partition('=')[0] for x in options if re.match('--[a-z]', x)):
+            _require(option in known[path], f'hmsa {path} has no option {option!r} ({code})')
+
+
 def _check_launch(name: str, rest: list[str]) -> None:
     file = ROOT / 'launch' / name
     _require(file.is_file(), f'no launch file {name!r}')

@@ -12,6 +12,7 @@ from documents import (
     Block,
     blocks,
     check,
+    check_named,
     commands,
     console,
     Failure,
@@ -54,6 +55,20 @@ def test_every_block_of_the_page_is_run_or_checked(page):
     for block in found:
         if not block.runs:
             check(block)
+
+
+@pytest.mark.parametrize('page', PAGES, ids=name_of)
+def test_commands_and_options_in_the_text_of_the_page_exist(page):
+    check_named(page.read_text(encoding='utf-8'))
+
+
+@pytest.mark.parametrize(('text', 'reason'), [
+    ('see `hmsa plann`', "command of 'hmsa plann'"), ('`hmsa bag inof`', 'no command of'),
+    ('with `hmsa plan 1.1:10\n--shapr zvd`', "hmsa plan has no option '--shapr'"),
+    ('`hmsa init --beam --lenght=3`', "hmsa init has no option '--lenght'")])
+def test_a_wrong_name_in_the_text_is_found(text, reason):
+    with pytest.raises(Failure, match=reason):
+        check_named(text)
 
 
 @pytest.mark.ros
