@@ -2,12 +2,15 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from benchmarks import bench_harm, laboratory
 from hmsa import Actuator
 from hmsa.model.modes import Modes
 from hmsa.model.simulation import ActuatorSimulation
+from hmsa_lab.adapt.estimator import Estimator
+from hmsa_lab.adapt.prior import Prior
 
 pytestmark = pytest.mark.thorough
 
@@ -66,3 +69,23 @@ def test_feedback_leaves_no_more_than_open_loop_where_the_model_lacks_a_mode(nam
     plain, corrected = (bench_harm.run(bench, x) for x in ('open loop', way))
     excess = [y.size - x.size for x, y in zip(plain, corrected, strict=True)]
     assert max(excess) < 0.005
+
+
+@pytest.mark.parametrize('share', [0.0, 0.05])
+def test_a_fast_mode_is_told_from_noise_by_few_samples(share):
+    # One sample says little about the next one: once feedback took this for G and a lag.
+    block = Actuator(half_length=0.01, damping_ratio=0.05, chain_limit=5.0).block
+    true = replace(block, modes=Modes((3.2,), (share,), (0.02,))) if share else block
+    every, begin = round(1e9 * block.period / 16.0), round(6e9 * block.period)
+    motion, estimator = ActuatorSimulation(true, time=0), Estimator(
+        Prior.nominal(block, suspects=True))
+    level = 0.25 * block.flux_density_unit
+    motion.command(begin, level)
+    estimator.set_levels([(0, 0.0), (begin, level)])
+    random, found = np.random.default_rng(0), []
+    for number in range(1, 12 * 16):
+        motion.advance(number * every)
+        estimator.sample(number * every, motion.stretch + 7e-4 * random.standard_normal())
+        if number % 8 == 0:
+            found.append(estimator.update(number * every).coherent)
+    assert any(found) is (share > 0.0)

@@ -32,10 +32,9 @@ _MORE = 1.3
 # number of standard deviations by which it surely differs from that.
 _POOR, _USUAL, _SURELY = 1.0, 0.5, 5.0
 # Time scales from the beginning of a window, and samples in them, in which residuals are compared
-# with their successors; correlation from which they are no noise, if it surely differs from 0;
-# and their size as a fraction of the motion: a mode with 7 % of the step leaves 0.01, creep and
-# lag 7e-4 until they are known.
-_EARLY, _FEWEST, _FOLLOWS, _MATTERS = 8.0, 20, 0.3, 0.004
+# with their successors; number of successors; and the size of what follows as a fraction of the
+# motion: a mode with 7 % of the step leaves 0.01, creep and lag 7e-4 until they are known.
+_EARLY, _FEWEST, _LAGS, _MATTERS = 8.0, 20, 10, 0.004
 # Standard deviations of a jump of bias and gain of the sensor, and its prior improbability as a
 # logarithm.
 _JUMPS, _RARELY = np.array([0.05, 0.1]), 3.0
@@ -335,9 +334,14 @@ class Window:
             return False
         most = 3.0 * robust_scale(left)
         left = np.minimum(np.maximum(left, -most), most)
-        common, square = float(left[:-1] @ left[1:]), float(left @ left)
-        return common > square * max(_FOLLOWS, _SURELY / math.sqrt(len(left))) and (
-            common > len(left) * (_MATTERS * float(np.ptp(self.stretch))) ** 2)
+        count, square = len(left), float(left @ left)
+        # Of noise, chi-squared with as many degrees of freedom (G. E. P. Box and D. A. Pierce,
+        # J. Am. Stat. Assoc. 65 (1970) 1509); of a sinusoid, half the number of samples for each.
+        seen = count * sum(float(left[:-x] @ left[x:]) ** 2 for x in range(
+            1, _LAGS + 1)) / square ** 2 - _LAGS
+        return seen > _SURELY * math.sqrt(2.0 * _LAGS) and square * math.sqrt(
+            2.0 * seen / (_LAGS * count)) > count * (
+                _MATTERS * float(np.ptp(self.stretch))) ** 2
 
     def _is_poor(self, found: Optimum, noise: float, more: float = 0.0) -> bool:
         """
