@@ -286,6 +286,25 @@ def test_after_a_cut_off_the_planner_waits_and_then_starts_from_where_the_actuat
     assert rig.residual(1.4) < 1e-6
 
 
+@pytest.mark.parametrize('reaction', ['wait', 'resume'])
+def test_a_planner_that_stood_still_sends_nothing_until_it_knows_of_the_coil(reaction):
+    rig = Bench(settings=replace(BEATING, after_cut_off=reaction, takeover_timeout=500 * MS))
+    rig.go(trajectory(*((1.2 + 0.1 * (i % 2), 400 * i * MS) for i in range(1, 20))),
+           START + 600 * MS)
+    rig.runtime.serve_by(rig.steady)
+    rig.cut_off()
+    sent = len(rig.sent)
+    rig.now, rig.steady = rig.now + 1700 * MS, rig.steady + 1700 * MS
+    # Nothing arrives yet, not even what was sent during the stall.
+    rig.run(rig.now + 3000 * MS)
+    assert [x.flux_density for _, x in rig.sent[sent:]] == []
+    rig.come_back()
+    rig.run(rig.now + 1000 * MS)
+    assert rig.sent[sent][1].flux_density == 0.0
+    assert ('cut_off' in rig.codes()) == (reaction == 'wait')
+    assert any(x.flux_density for _, x in rig.sent[sent:]) == (reaction == 'resume')
+
+
 def test_a_planner_that_is_asked_for_nothing_leaves_a_device_cut_off():
     rig = Bench(settings=WAITING)
     rig.cut_off()

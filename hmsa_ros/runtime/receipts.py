@@ -1,7 +1,7 @@
 """Receipts of plant or driver: acknowledged commands, and the offset of the device's clock."""
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -365,6 +365,12 @@ class Receipts:
         known = self._known(joint)
         step, known.step = known.step, 0
         return step
+
+    def miss(self, joints: Iterable[str]) -> None:
+        """Have devices be silent from the next look on, until a receipt arrives."""
+        for name in joints:
+            if (known := self.joints.get(name)) is not None:
+                known.arrived = min(known.arrived, self.steady() - _PATIENCE - 1)
 
     def look(self) -> list[str]:
         """Return the joints whose device has fallen silent, or is received again."""

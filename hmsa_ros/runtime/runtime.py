@@ -49,7 +49,7 @@ from hmsa_ros.timekeeping import clock_set_words, Throttle
 # In ns by the steady clock: delay of a service that is a stall of this process; time that the
 # middleware then takes to deliver what has arrived; and time within which a device that is within
 # reach gives a receipt, of which there are five a second.
-_STALL, _SETTLE, _OWED = 200_000_000, 50_000_000, 500_000_000
+_STALL, _SETTLE, _OWED = 200_000_000, 50_000_000, 800_000_000
 # Heartbeats without which a watchdog is not expected to trip.
 _LOST = 2
 # Clock jumps that follow each other within this time are reported once.
@@ -496,6 +496,10 @@ class Runtime:
             least, most = self._listens_until
             if steady >= (most if self._unheard else least):
                 self._listens_until = None
+                if self._unheard:
+                    # The coil may be off. The stall itself is not a silence of the device.
+                    self.devices.look()
+                    self.devices.receipts.miss(self._unheard)
         return self._listens_until is not None
 
     def tick(self, now: int) -> list[Output]:
