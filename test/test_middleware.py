@@ -103,7 +103,8 @@ rclpy.init()
 rclpy.create_node('node').create_subscription(Empty, 'topic', lambda message: None, 1)
 print('lark' in sys.modules)
 """)
-    assert (node.wait(), node.output.strip()) == (0, 'False')
+    # Above it, the middleware may print that another process of the host takes a port just now.
+    assert (node.wait(), node.stdout.splitlines()[-1:]) == (0, ['False'])
 
 
 @pytest.mark.parametrize(('distro', 'place'), [('jazzy', 0), ('kilted', 1), ('rolling', 1)])
