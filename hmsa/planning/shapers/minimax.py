@@ -282,7 +282,8 @@ def _room(request: MoveRequest, frame: _Frame, loads: Array, stride: float) -> A
     if request.delivery.slew < math.inf:
         way = np.diff(loads, prepend=request.load)
         up, down = np.append(up, frame.room - way), np.append(down, frame.room + way)
-    return np.maximum(np.append(up, down), _LEAST_ROOM * stride)
+    room: Array = np.maximum(np.append(up, down), _LEAST_ROOM * stride)
+    return room
 
 
 def _search(
