@@ -300,7 +300,8 @@ def _search(
 
     starts = [_reached(request, frame, x) for x in _starts(request, chain, frame)]
     now, loads = min(((vibration(x), x) for x in starts), key=lambda x: largest(x[0]))
-    stride, slopes = _STRIDE * span, np.empty(0)
+    stride = _STRIDE * span
+    slopes: Array = np.empty(0)
     rows = np.eye(len(loads))
     if request.delivery.slew < math.inf:
         rows = np.vstack([rows, rows - np.eye(len(loads), k=-1)])
