@@ -335,6 +335,8 @@ class Window:
         most = 3.0 * robust_scale(left)
         left = np.minimum(np.maximum(left, -most), most)
         count, square = len(left), float(left @ left)
+        if square == 0.0:
+            return False
         # Of noise, chi-squared with as many degrees of freedom (G. E. P. Box and D. A. Pierce,
         # J. Am. Stat. Assoc. 65 (1970) 1509); of a sinusoid, half the number of samples for each.
         seen = count * sum(float(left[:-x] @ left[x:]) ** 2 for x in range(
