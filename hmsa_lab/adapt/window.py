@@ -35,6 +35,9 @@ _POOR, _USUAL, _SURELY = 1.0, 0.5, 5.0
 # with their successors; number of successors; and the size of what follows as a fraction of the
 # motion: a mode with 7 % of the step leaves 0.01, creep and lag 7e-4 until they are known.
 _EARLY, _FEWEST, _LAGS, _MATTERS = 8.0, 20, 10, 0.004
+# Residuals as a fraction of the simulated motion, above which there is none to compare with: in
+# test_temperature and test_feedback_modes 0.22 or more at rest, and at most 0.14 in motion.
+_MOVES = 0.2
 # Standard deviations of a jump of bias and gain of the sensor, and its prior improbability as a
 # logarithm.
 _JUMPS, _RARELY = np.array([0.05, 0.1]), 3.0
@@ -335,7 +338,8 @@ class Window:
         most = 3.0 * robust_scale(left)
         left = np.minimum(np.maximum(left, -most), most)
         count, square = len(left), float(left @ left)
-        if square == 0.0:
+        moved = float(np.ptp((self.stretch - found.here.residual)[early]))
+        if not 0.0 < square < count * (_MOVES * moved) ** 2:
             return False
         # Of noise, chi-squared with as many degrees of freedom (G. E. P. Box and D. A. Pierce,
         # J. Am. Stat. Assoc. 65 (1970) 1509); of a sinusoid, half the number of samples for each.
