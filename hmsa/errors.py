@@ -42,6 +42,11 @@ class BagError(HmsaError):
     """A recording that cannot be read or written."""
 
 
+def add_words(error: HmsaError, *more: str) -> None:
+    """Add likely reasons or remedies to the message of an error."""
+    error.args = ('; '.join((str(error), *more)),)
+
+
 class AssumedWarning(UserWarning):
     """
     An assumption about ambiguous input, such as which of its columns is the time.

@@ -27,7 +27,7 @@ from hmsa.cli.options import (
     temperature_option,
 )
 from hmsa.cli.terminal import progress
-from hmsa.errors import BadInputError
+from hmsa.errors import add_words, BadInputError
 from hmsa.files import check_targets
 from hmsa.table import Column, Table
 
@@ -256,7 +256,7 @@ def _along(actuator: 'Actuator', arguments: argparse.Namespace) -> int:
         plan = actuator.follow(*points)
     except RefusedError as error:
         if error.code is Code.TOO_LONG:
-            error.args = (f'{error}; if times are in ms, {remedy("time", "ms", True)}',)
+            add_words(error, f'if times are in ms, {remedy("time", "ms", True)}')
         raise
     if arguments.out is not None:
         plan.save(arguments.out)

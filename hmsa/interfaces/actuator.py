@@ -5,7 +5,7 @@ from dataclasses import replace
 import math
 from typing import Any, TYPE_CHECKING
 
-from hmsa.errors import BadInputError
+from hmsa.errors import add_words, BadInputError
 from hmsa.interfaces.parameters import (
     ACTUATOR_FIELDS,
     BULK_RATIO,
@@ -58,8 +58,7 @@ def actuator_from(
         return _actuator_from(values, modulus)
     except BadInputError as error:
         form = str(values.get(LAW_NAME.name))
-        error.args = ('; '.join((
-            str(error), *mistakes(form if form in FORMS else 'block', values))),)
+        add_words(error, *mistakes(form if form in FORMS else 'block', values))
         raise
 
 
