@@ -113,13 +113,13 @@ COMPILED = [
     '-std=c++17', '-O2', '-ftree-vectorize', '-ffp-contract=off', '-fno-math-errno',
     '-fno-trapping-math', '-fvisibility=hidden', '-fno-exceptions', '-fno-rtti', '-Wno-psabi',
     '-g0']
-MOTION, DERIVATIVES = (Extension(
-    f'hmsa.motion._{x}', [f'hmsa/motion/{x}.cpp'], include_dirs=['hmsa/motion'],
+MOTION, DERIVATIVES, RINGING = (Extension(
+    name, [source], include_dirs=['hmsa/motion'],
     depends=sorted(glob('hmsa/motion/**/*.hpp', recursive=True)), language='c++',
-    extra_compile_args=COMPILED) for x in ('motion', 'derivatives'))
-RINGING = Extension(
-    'hmsa.judge._ringing', ['hmsa/judge/_ringing.cpp'], language='c++',
-    extra_compile_args=COMPILED)
+    extra_compile_args=COMPILED) for name, source in (
+        ('hmsa.motion._motion', 'hmsa/motion/motion.cpp'),
+        ('hmsa.motion._derivatives', 'hmsa/motion/derivatives.cpp'),
+        ('hmsa.judge._ringing', 'hmsa/judge/_ringing.cpp')))
 BOARD = Extension(
     'hmsa_lab.bench._board', ['hmsa_lab/bench/_board.cpp'],
     include_dirs=['hmsa_lab/bench'], depends=['hmsa_lab/bench/hmsa_board/board.hpp'],

@@ -1,13 +1,10 @@
 // Fits of samples for the judge: an offset with a drift or creep, and decaying sinusoids (fit.py).
-#define PY_SSIZE_T_CLEAN
-#include <Python.h>
+#include "bind.hpp"
 
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
-#include <cstring>
 #include <limits>
-#include <vector>
 
 namespace {
 
@@ -1079,109 +1076,45 @@ Found fit(const Array &time, const Array &values, const Settings &settings)
 
 // -- bindings ------------------------------------------------------------------------------------
 
-struct Buffer {
-    Py_buffer view{};
-    bool read(PyObject *from, const char *formats)
-    {
-        if (PyObject_GetBuffer(from, &view, PyBUF_C_CONTIGUOUS | PyBUF_FORMAT)) {
-            return false;
-        }
-        if (view.itemsize == 8 && std::strchr(formats, *view.format) && !view.format[1]) {
-            return true;
-        }
-        PyErr_Format(PyExc_TypeError, "expected an array of %s", formats);
-        return false;
-    }
-    int count() const { return int(view.len / 8); }
-    ~Buffer()
-    {
-        if (view.obj) {
-            PyBuffer_Release(&view);
-        }
-    }
-};
+using hmsa::Numbers;
+using Four_of = std::tuple<double, double, double, double>;
 
-Array array_of(const Buffer &from)
-{
-    const double *data = static_cast<const double *>(from.view.buf);
-    return Array(data, data + from.count());
-}
+Array array_of(Numbers from) { return Array(from.data, from.data + from.count); }
+Four_of numbers_of(const Bounded &x) { return {x.value, x.deviation, x.low, x.high}; }
 
-PyObject *fit_samples(PyObject *, PyObject *arguments)
+// Returns nothing if the samples do not determine the vibration.
+std::optional<std::tuple<Four_of, Four_of, std::vector<std::tuple<double, double>>, double, double,
+                         double, double>>
+fit_samples(Numbers time, Numbers values, double frequency, double decay, double beyond, double z,
+            double nothing, int creep)
 {
-    PyObject *time, *values;
-    Settings settings;
-    int creep;
-    if (!PyArg_ParseTuple(arguments, "OOdddddp", &time, &values, &settings.frequency,
-                          &settings.decay, &settings.beyond, &settings.z, &settings.nothing,
-                          &creep)) {
-        return nullptr;
+    if (!hmsa::fit(time.count == values.count) || time.count < fewest
+        || !((time[time.count - 1] - time[0]) * frequency / (2.0 * pi) >= shortest)) {
+        return {};
     }
-    settings.creep = creep;
-    Buffer times, numbers;
-    if (!times.read(time, "d") || !numbers.read(values, "d")) {
-        return nullptr;
-    }
-    const Array t = array_of(times), y = array_of(numbers);
-    if (t.size() != y.size()) {
-        PyErr_SetString(PyExc_ValueError, "expected as many times as values");
-        return nullptr;
-    }
-    if (int(t.size()) < fewest
-        || !((t.back() - t.front()) * settings.frequency / (2.0 * pi) >= shortest)) {
-        Py_RETURN_NONE;
-    }
-    const Found found = fit(t, y, settings);
-    PyObject *waves = PyTuple_New(Py_ssize_t(found.waves.size()));
-    if (!waves) {
-        return nullptr;
-    }
+    const Found found = fit(array_of(time), array_of(values), {
+        frequency, decay, beyond, z, nothing, creep != 0});
+    std::vector<std::tuple<double, double>> waves;
     for (size_t i = 0; i < found.waves.size(); ++i) {
-        PyTuple_SET_ITEM(waves, Py_ssize_t(i), Py_BuildValue(
-            "dd", found.waves[i].omega, found.swings[i]));
+        waves.emplace_back(found.waves[i].omega, found.swings[i]);
     }
-    const Bounded &o = found.offset, &v = found.vibration;
-    return Py_BuildValue(
-        "(dddd)(dddd)Ndddd", o.value, o.deviation, o.low, o.high, v.value, v.deviation, v.low,
-        v.high, waves, found.noise, found.usual, found.independent, found.resolved);
+    return std::tuple{numbers_of(found.offset), numbers_of(found.vibration), waves, found.noise,
+                      found.usual, found.independent, found.resolved};
 }
 
-PyObject *largest_motion(PyObject *, PyObject *arguments)
+double largest_motion(hmsa::Places stamps, Numbers values, int64_t begin, int64_t period)
 {
-    PyObject *stamps, *values;
-    long long begin, period;
-    if (!PyArg_ParseTuple(arguments, "OOLL", &stamps, &values, &begin, &period)) {
-        return nullptr;
+    Array since;
+    for (int i = 0; i < stamps.count; ++i) {
+        since.push_back(double(stamps[i] - begin));
     }
-    Buffer times, numbers;
-    if (!times.read(stamps, "lq") || !numbers.read(values, "d")) {
-        return nullptr;
-    }
-    const auto *t = static_cast<const int64_t *>(times.view.buf);
-    Array since(size_t(times.count()), 0.0);
-    for (size_t i = 0; i < since.size(); ++i) {
-        since[i] = double(t[i] - begin);
-    }
-    const Array y = array_of(numbers);
-    return PyFloat_FromDouble(largest(
-        since.data(), y.data(), int(std::min(since.size(), y.size())), 0.0,
-        double(std::max(period, 1LL))));
-}
-
-PyObject *student(PyObject *, PyObject *arguments)
-{
-    double freedom, probability, z;
-    if (!PyArg_ParseTuple(arguments, "ddd", &freedom, &probability, &z)) {
-        return nullptr;
-    }
-    return PyFloat_FromDouble(quantile(freedom, probability, z));
+    return largest(since.data(), values.data, std::min(stamps.count, values.count), 0.0,
+                   double(std::max(period, int64_t(1))));
 }
 
 PyMethodDef methods[] = {
-    {"fit", fit_samples, METH_VARARGS, nullptr},
-    {"largest", largest_motion, METH_VARARGS, nullptr},
-    {"quantile", student, METH_VARARGS, nullptr},
-    {nullptr, nullptr, 0, nullptr}};
+    hmsa::method<fit_samples>("fit"), hmsa::method<largest_motion>("largest"),
+    hmsa::method<quantile>("quantile"), {nullptr, nullptr, 0, nullptr}};
 
 PyModuleDef definition{
     PyModuleDef_HEAD_INIT, "_ringing", nullptr, -1, methods, nullptr, nullptr, nullptr, nullptr};

@@ -2,7 +2,9 @@
 #pragma once
 #define PY_SSIZE_T_CLEAN
 #include <Python.h>
+#include <optional>
 #include <tuple>
+#include <vector>
 #ifdef __SSE2__
 #include <xmmintrin.h>
 #endif
@@ -67,6 +69,14 @@ template <> struct Argument<int> {
         return got != -1 || !PyErr_Occurred();
     }
 };
+template <> struct Argument<int64_t> {
+    int64_t got;
+    bool read(PyObject *from)
+    {
+        got = PyLong_AsLongLong(from);
+        return got != -1 || !PyErr_Occurred();
+    }
+};
 // Released at the end.
 template <class T> struct Argument<Array<T>> {
     Py_buffer view{};
@@ -117,6 +127,7 @@ inline PyObject *made(int x) { return PyLong_FromLong(x); }
 inline PyObject *made(bool x) { return PyBool_FromLong(x); }
 struct Nothing {};
 inline PyObject *made(Nothing) { Py_RETURN_NONE; }
+template <class... T> PyObject *made(const std::vector<std::tuple<T...>> &all);
 template <class... T> PyObject *made(const std::tuple<T...> &all)
 {
     PyObject *out = PyTuple_New(sizeof...(T));
@@ -124,6 +135,14 @@ template <class... T> PyObject *made(const std::tuple<T...> &all)
     std::apply([&](const T &...x) { (PyTuple_SET_ITEM(out, i++, made(x)), ...); }, all);
     return out;
 }
+template <class... T> PyObject *made(const std::vector<std::tuple<T...>> &all)
+{
+    PyObject *out = PyTuple_New(Py_ssize_t(all.size()));
+    for (size_t i = 0; i < all.size(); i++)
+        PyTuple_SET_ITEM(out, Py_ssize_t(i), made(all[i]));
+    return out;
+}
+template <class T> PyObject *made(const std::optional<T> &x) { return x ? made(*x) : made(Nothing{}); }
 template <class R, class... A, size_t... I> PyObject *call(
     R (*f)(A...), PyObject *const *from, Py_ssize_t count, std::index_sequence<I...>)
 {
