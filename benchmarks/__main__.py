@@ -100,8 +100,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument('--hours', type=float, default=8.0,
                         help='soak: simulated time (default 8)')
     parser.add_argument('--minutes', type=float, default=float('inf'),
-                        help='soak: time on the wall for the part with processes, at most; rates: '
-                             'roughly, of all')
+                        help='soak: time on the wall, at most; rates: roughly, of all')
     parser.add_argument('--factor', type=float, default=None,
                         help='soak: real-time factor asked for, 0 for as fast as it can')
     parser.add_argument('--rate', type=float, default=1000.0,

@@ -1,15 +1,14 @@
 """
 Soak test: hours of operation, compressed in time, with every kind of fault.
 
-It has two parts. Over DDS: plant, planner and recorder run as real processes; the plant drives
-simulated time as fast as it can, at 1 kHz or another rate. Cycles of two kinds alternate, each
-with a bag of its own. Calm cycles contain random setpoints, sequences, stops, garbage on the
-planner's inputs, and kills of planner or recorder; the bag holds all their samples and commands,
-and integrating the commands again must give the samples. Rough cycles add garbage on every topic
-and service, and the plant is paused, reset and killed too; there, no node may raise or end, and
-the recorder may lose nothing. A second recorder, the witness, runs from the first cycle to the
-last, and the `mcap` package counts what it has written. In process: the cores of planner and
-plant with messages between them, for all hours, at 1 kHz.
+Plant, planner and recorder run as real processes; the plant drives simulated time as fast as it
+can, at 1 kHz or another rate. Cycles of two kinds alternate, each with a bag of its own. Calm
+cycles contain random setpoints, sequences, stops, garbage on the planner's inputs, and kills of
+planner or recorder; the bag holds all their samples and commands, and integrating the commands
+again must give the samples. Rough cycles add garbage on every topic and service, and the plant is
+paused, reset and killed too; there, no node may raise or end, and the recorder may lose nothing. A
+second recorder, the witness, runs from the first cycle to the last, and the `mcap` package counts
+what it has written.
 
 The memory of each process is sampled throughout; it must not grow. To make growth visible, plant
 and planner are killed in the first third only and run through the rest.
@@ -19,7 +18,6 @@ from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
-import gc
 from itertools import cycle
 import math
 import multiprocessing
@@ -96,7 +94,7 @@ class Witness:
 
 @dataclass
 class Result:
-    """Result of the soak over DDS."""
+    """Result of the soak."""
 
     hours: float = 0.0  # simulated
     wall: float = 0.0  # wall-clock hours
@@ -529,7 +527,7 @@ class Soak:
         self._pass(2.0 * self._lead)
 
 
-def run_over_dds(
+def run(
         folder: Path, domain: int, *, hours: float, minutes: float, length: float,
         factor: float, rate: float = RATE, seed: int = 1) -> Result:
     """Stress real processes for hours of simulated time or minutes of wall time."""
@@ -556,120 +554,6 @@ def run_over_dds(
     return soak.result
 
 
-@dataclass
-class Core:
-    """Result of the soak in process."""
-
-    hours: float  # simulated
-    wall: float  # wall-clock hours
-    steps: int  # of 1 ms
-    requests: int
-    refused: int  # requests that were garbage
-    commands: int
-    drift: int  # time at the end less the steps that were made, in ns
-    difference: float  # of the stretch from the planner's prediction
-    memory: list[Sample]
-    trend: Trend
-
-    def failures(self) -> list[str]:
-        """Return the requirements that are not met, as sentences."""
-        found = []
-        if self.drift:
-            found.append(f'in process: time drifted by {self.drift} ns')
-        if not self.difference < 1e-6:
-            found.append(
-                f'in process: stretch {self.difference:.1e} from what was predicted')
-        if not self.trend.flat:
-            found.append(
-                f'in process: memory grows by {self.trend.slope / 2**20:.2f} MiB an hour')
-        return found
-
-
-def run_in_process(hours: float, seed: int = 2) -> Core:
-    """
-    Drive planner and plant without processes, for all hours, at 1 kHz.
-
-    Commands pass between them as serialised messages. Requests come at random, many before the
-    last move is complete, some of them garbage. Occasionally a new planner replaces the old one
-    while the actuator is at rest.
-
-    Parameters
-    ----------
-    hours : float
-        Simulated hours.
-    seed : int
-        Seed of all random choices.
-
-    Returns
-    -------
-    Core
-        Result.
-
-    """
-    from rclpy.serialization import deserialize_message, serialize_message
-    from sensor_msgs.msg import MagneticField
-
-    from hmsa.errors import HmsaError
-    from hmsa.model.parameters import paper_actuator
-    from hmsa.model.simulation import ActuatorSimulation
-    from hmsa.planning.planner import Options, Planner
-    from hmsa_ros.nodes.conversions import from_command, to_command
-
-    dice = random.Random(seed)
-    wild = (math.nan, math.inf, -1.0, 0.0, 1e300, 2.7, 0.2)
-    options = Options(
-        short_spell='continue', flux_density_min=-0.5, flux_density_max=0.5)
-    actuator = paper_actuator()
-    planner = Planner(actuator, options)
-    begin = _NANOSECONDS
-    plant = ActuatorSimulation(actuator, time=begin)
-    steps = round(hours * _HOUR * _NANOSECONDS / _STEP_NS)
-    requests = refused = commands = 0
-    difference = 0.0
-    memory = []
-    started = monotonic()
-    now, again = begin, 0
-    for step in range(steps):
-        if step >= again:
-            requests += 1
-            again = step + dice.choice((1, 2, 3, 5, 8, 20, 100, 1000))
-            choice = dice.random()
-            try:
-                if choice < 0.5:
-                    planner.setpoint(dice.uniform(0.7, 1.6), now)
-                elif choice < 0.8:
-                    end, points = 0, []
-                    for _ in range(dice.randrange(1, 6)):
-                        end += dice.randrange(5_000_000, 300_000_000)
-                        points.append((dice.uniform(0.7, 1.6), end))
-                    planner.request(points, None, now)
-                elif choice < 0.9:
-                    planner.stop(now)
-                else:
-                    planner.request([(dice.choice(wild), 10**7), (1.1, 10**6)], -5, now)
-            except HmsaError:
-                refused += 1
-        for level in planner.due(now):
-            sent = serialize_message(to_command(level.stamp, level.flux_density, 'coil'))
-            stamp, flux_density = from_command(deserialize_message(sent, MagneticField))
-            plant.command(stamp, flux_density)
-            commands += 1
-        now += _STEP_NS
-        plant.advance(now)
-        if step % 997 == 0:
-            difference = max(
-                difference, abs(planner.state(now).stretch - plant.stretch))
-        if step % 60_000 == 0:
-            # Until then, Python keeps up to 40,000 freed tuples for reuse, some 2 MiB.
-            gc.collect()
-            passed = step * _STEP_NS / _NANOSECONDS / _HOUR
-            memory.append(Sample(passed, 1, passed, *used(os.getpid())))
-    return Core(
-        hours, (monotonic() - started) / _HOUR, steps, requests, refused, commands,
-        plant.time - begin - steps * _STEP_NS, difference, memory,
-        trend(memory, min(_SETTLE_HOURS, 0.3 * hours)))
-
-
 def draw(result: Result, file: Path) -> None:
     """Draw the memory of the processes over simulated time as a PNG."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -692,8 +576,8 @@ def draw(result: Result, file: Path) -> None:
     figure.savefig(file, dpi=120)
 
 
-def report(result: Result, core: Core, rate: float = RATE) -> list[str]:
-    """Return the results of both parts as sentences for the console and the page."""
+def report(result: Result, rate: float = RATE) -> list[str]:
+    """Return the results as sentences for the console and the page."""
     calm = [x for x in result.cycles if x.kind == 'calm']
     checked = [x.difference for x in calm if not x.late and not math.isnan(x.difference)]
     lines = [
@@ -715,15 +599,8 @@ def report(result: Result, core: Core, rate: float = RATE) -> list[str]:
             f'A recorder lived for {seen.hours:.2f} h of it: {seen.files} files, {seen.samples} '
             f'samples and {seen.messages} messages as the mcap package counts them, {seen.told} '
             f'by its own metadata, {seen.lost} lost.')
-    lines += [
-        f'Memory of the {name}: {_trend_text(x)}.' for name, x in result.trends.items()]
-    lines += [
-        f'In process: {core.hours:g} h at 1 kHz in {60.0 * core.wall:.1f} min, '
-        f'{core.requests} requests, {core.refused} of them refused, {core.commands} commands; '
-        f'time {core.drift} ns off after {core.steps} steps, stretch at most '
-        f'{core.difference:.1e} from what the planner predicted; memory '
-        f'{_trend_text(core.trend)}.']
-    return lines
+    return [*lines, *(
+        f'Memory of the {name}: {_trend_text(x)}.' for name, x in result.trends.items())]
 
 
 def _trend_text(found: Trend) -> str:
@@ -738,21 +615,19 @@ def _trend_text(found: Trend) -> str:
 def compare(
         *, quick: bool, hours: float = 8.0, minutes: float = math.inf,
         factor: float | None = None, rate: float = RATE, picture: Path | None = None) -> Sheet:
-    """Run both parts; passed if all requirements are met."""
+    """Stress the processes; passed if all requirements are met."""
     length = 300.0
     if factor is None:
         factor = FACTOR * max(RATE / rate, 1.0)
     if quick:
         hours, minutes, length = 0.05, 0.4, 30.0
     with tempfile.TemporaryDirectory(prefix='hmsa_soak_') as folder:
-        result = run_over_dds(
+        result = run(
             Path(folder), ros_domain(), hours=hours, minutes=minutes, length=length,
             factor=factor, rate=rate)
-    core = run_in_process(hours)
     if picture is not None:
         draw(result, picture)
-    failures = [*result.failures(), *core.failures()]
+    failures = result.failures()
     return Sheet(
-        'soak', 'Soak', (), (), {
-            'over_dds': asdict(result), 'in_process': asdict(core), 'failures': failures},
-        not failures, report(result, core, rate), [f'FAILED: {x}' for x in failures])
+        'soak', 'Soak', (), (), {**asdict(result), 'failures': failures}, not failures,
+        report(result, rate), [f'FAILED: {x}' for x in failures])

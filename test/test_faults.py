@@ -127,15 +127,6 @@ def test_memory_of_a_process_is_read_and_one_that_is_gone_has_none():
     assert memory.used(2**22 + 1) == (0, 0, 0)
 
 
-def test_planner_and_plant_agree_over_minutes_without_drift():
-    core = bench_soak.run_in_process(0.02)
-    assert core.failures() == []
-    assert core.steps == 72_000
-    assert core.drift == 0
-    assert 0 < core.refused < core.requests < core.commands
-    assert core.difference < 1e-9
-
-
 def test_garbage_among_the_samples_of_a_rough_bag_is_counted_and_not_read(tmp_path):
     with BagWriter(tmp_path / 'bag') as writer:
         number = writer.add_topic(BagTopic('/joint_states', 'sensor_msgs/msg/JointState'))
