@@ -31,7 +31,7 @@ from hmsa.model.moves import Level, State
 from hmsa.model.parameters import NondimensionalParameters
 from hmsa.model.simulation import sampled
 from hmsa.model.status import Code
-from hmsa.planning.two_step import CODES, Groups, plan_two_step, plan_two_step_batch, TwoStep
+from hmsa.planning.two_step import CODES, Groups, plan_two_step, plan_two_step_batch
 
 mpmath = needs('mpmath')
 
@@ -600,21 +600,6 @@ def test_the_plan_of_a_row_is_the_same_to_the_bit_in_any_batch():
     for wide in (True, False):
         _, mixed = planned([x[order] for x in rows], wide=wide)
         assert mixed.tobytes() == found[:, order].tobytes()
-
-
-def test_plans_of_a_batch_end_at_rest_by_an_integration_of_its_own():
-    start, target, zeta, j_lim, _ = blocks_from_rest(400)
-    rows = np.flatnonzero((np.abs(target - start) > 0.05) & (j_lim > 0.5) & (j_lim < 50.0))[:12]
-    batch = plan_two_step_batch(
-        start[rows], target[rows], Groups(zeta=zeta[rows], j_lim=j_lim[rows]))
-    for i, row in enumerate(rows):
-        plan = TwoStep(
-            CODES[int(batch.status[i])], batch.beta_p[i], batch.tau_p[i], batch.beta_1[i], 0)
-        if plan.code is Code.TWO_STEP:
-            material = group(float(zeta[row]), float(j_lim[row]))
-            end = after_plan(start[row], 0.0, plan, material)
-            assert distance(end, target[row], material) < AT_REST * abs(target[row] - start[row])
-    assert np.mean(batch.status == TWO_STEP) > 0.4
 
 
 def test_batches_broadcast_their_arguments():
