@@ -174,49 +174,63 @@ def test_tables_are_no_longer_than_needed(bulk):
 
 # -- motion and plans ---------------------------------------------------------------------------
 
+def gent_stress(s):
+    """Return s psi' and its derivative by s."""
+    left = 1.0 - (s * s + 2.0 / s - 3.0) / J_LIM
+    stress = (s * s - 1.0 / s) / left
+    return stress, (2.0 * s + 1.0 / s ** 2) / left + stress * 2.0 * (
+        s - 1.0 / s ** 2) / J_LIM / left
+
+
 class Lagrangian:
     """
     The block by the stretch s at constant volume, of which length and side are given functions.
 
-    L = (c1/12 l'^2 + q'^2/3) - W + beta l, with the dissipation zeta c1/4 l'^2.
+    L = (c1/12 l'^2 + q'^2/3) - W + beta l, with the dissipation zeta c1/4 l'^2, and with the
+    overstress of branches of ratios and times.
     """
 
-    def __init__(self, bulk, zeta=0.2, c1=2.0, exponent=0.0):
+    def __init__(
+            self, bulk, zeta=0.2, c1=2.0, exponent=0.0, stress=gent_stress, ratios=(), times=()):
         self.bulk, self.zeta, self.c1, self.exponent = bulk, zeta, c1, exponent
+        self.stress, self.ratios, self.times = stress, np.array(ratios), np.array(times)
 
     def shape(self, s):
-        """Return length, side, and their derivatives by s; of complex s, too."""
-        left = 1.0 - (s * s + 2.0 / s - 3.0) / J_LIM
-        stress = (s * s - 1.0 / s) / left
-        by_s = (2.0 * s + 1.0 / s ** 2) / left + stress * 2.0 * (s - 1.0 / s ** 2) / J_LIM / left
+        """Return length, side, their derivatives by s, force, and its; of complex s, too."""
+        stress, by_s = self.stress(s)
         volume = 0.5 + np.sqrt(0.25 + stress / (3.0 * self.bulk))
         grows = by_s / (3.0 * self.bulk * (2.0 * volume - 1.0))
         root = volume ** (1.0 / 3.0)
         change = root / volume * grows / 3.0
-        return (s * root, root / np.sqrt(s), root + s * change,
-                change / np.sqrt(s) - 0.5 * root * s ** -1.5, stress)
+        length, by_length = s * root, root + s * change
+        return (length, root / np.sqrt(s), by_length,
+                change / np.sqrt(s) - 0.5 * root * s ** -1.5, stress / length,
+                by_s / length - stress * by_length / length ** 2)
 
     def inertia(self, s):
-        stretch, _, length, side, _ = self.shape(s)
+        stretch, _, length, side, *_ = self.shape(s)
         return self.c1 / 6.0 * length ** 2 + 2.0 / 3.0 * side ** 2 * stretch ** -self.exponent
 
-    def follow(self, levels, end, start=1.0):
-        """Return stretch and rate at an end time, from rest."""
+    def follow(self, levels, end, start=1.0, rate=0.0, followed=None):
+        """Return stretch and rate at an end time, by default from rest with relaxed branches."""
         def motion(_, y, load):
-            s, v = y
-            length, _, by_s, _, stress = self.shape(s)
-            push = (load - stress / length) * by_s - (
+            s, v, held = y[0], y[1], y[2:]
+            _, _, by_s, _, force, by_force = self.shape(s)
+            push = (load - force - held.sum()) * by_s - (
                 0.5 * self.zeta * self.c1 * by_s ** 2 * v + 0.5 * slope(self.inertia, s) * v * v)
-            return v, push / self.inertia(s)
+            return [v, push / self.inertia(s), *(self.ratios * by_force * v - held / self.times)]
 
         s = 1.0 if start == 1.0 else brentq(
-            lambda x: self.shape(x)[0] - start, min(1.0, start), max(1.0, start), xtol=1e-15)
-        y = np.array([s, 0.0])
+            lambda x: self.shape(x)[0] - start, 0.8 * min(1.0, start), 1.2 * max(1.0, start),
+            xtol=1e-15)
+        _, _, by_s, _, force, _ = self.shape(s)
+        relaxed = force if followed is None else np.array(followed)
+        y = np.array([s, rate / by_s, *(self.ratios * (force - relaxed))])
         for x, until in zip(levels, [*(x.time for x in levels[1:]), end], strict=True):
             if until > x.time:
                 y = solve_ivp(motion, (x.time, until), y, method='DOP853', rtol=3e-14, atol=1e-15,
                               args=(x.load,)).y[:, -1]
-        length, _, by_s, _, _ = self.shape(y[0])
+        length, _, by_s, *_ = self.shape(y[0])
         return length, by_s * y[1]
 
 
