@@ -484,17 +484,21 @@ def _check_parameter(name: str, nodes: Iterable[str]) -> None:
              f'parameter {name!r} is not declared by {" or ".join(nodes)}')
 
 
-def _topic_names() -> dict[str, str]:
-    """Return each topic by its name from outside, without a namespace, with its type."""
+def topics_by_name() -> dict[str, Any]:
+    """Return the topics by their names from outside, for one joint without namespace."""
     from hmsa.interfaces import topics
 
-    found: dict[str, str] = {}
-    for topic in vars(topics).values():
-        if isinstance(topic, topics.Topic):
-            for node in (*topic.publishers, *topic.subscribers):
-                name = topics.from_outside(topic.name, node)
-                found[name if name.startswith('/') else '/' + name] = topic.type
-    return found
+    names = ((topics.from_outside(x.name, node), x) for x in vars(topics).values()
+             if isinstance(x, topics.Topic) for node in (*x.publishers, *x.subscribers))
+    return {name if name.startswith('/') else f'/{name}': topic for name, topic in names}
+
+
+def services_by_name() -> dict[str, Any]:
+    """Return the services by their names from outside, without a namespace."""
+    from hmsa.interfaces import topics
+
+    return {f'/{topics.from_outside(x.name, node)}': x for x in vars(topics).values()
+            if isinstance(x, topics.Service) for node in x.meaning}
 
 
 def _known_name(name: str, known: Iterable[str]) -> str | None:
@@ -519,7 +523,7 @@ def _check_installed(words: list[str]) -> None:
     elif kind in (['topic', 'pub'], ['service', 'call']):
         _check_message(kind[0], [x for x in plain[3:] if not re.fullmatch(r'\d+(\.\d+)?', x)])
     elif kind[:1] == ['topic'] and len(plain) > 3:
-        _require(_known_name(plain[3], _topic_names()), f'no topic {plain[3]!r}')
+        _require(_known_name(plain[3], topics_by_name()), f'no topic {plain[3]!r}')
     elif kind[:1] == ['param'] and len(plain) > 4 and kind[1] in ('get', 'set', 'describe'):
         node = plain[3].rpartition('/')[2]
         _require(node in _nodes(), f'no node {plain[3]!r}')
@@ -593,25 +597,18 @@ def _check_launch(name: str, rest: list[str]) -> None:
 
 def _check_message(kind: str, words: list[str]) -> None:
     """Require that a payload matches the type, and the type the topic or service."""
-    from hmsa.interfaces import topics
-
     name, type_name = words[:2]
     package, group, cls = type_name.split('/')
     message = getattr(import_module(f'{package}.{group}'), cls)
     if kind == 'topic':
-        types = _topic_names()
-        known: str | None = _known_name(name, types)
-        _require(known, f'no topic {name!r}')
-        _require(types[str(known)] == type_name,
-                 f'{name} has type {types[str(known)].rpartition("/")[2]}, not {type_name}')
+        known = topics_by_name()
     else:
-        services = {
-            topics.from_outside(x.name, node): x.type for x in vars(topics).values()
-            if isinstance(x, topics.Service) for node in x.meaning}
-        known = _known_name(name, services)
-        _require(known, f'no service {name!r}')
-        _require(services[str(known)] == type_name, f'{name} does not have type {type_name}')
-        message = message.Request
+        known, message = services_by_name(), message.Request
+    found = _known_name(name, known)
+    _require(found, f'no {kind} {name!r}')
+    is_type = known[str(found)].type
+    _require(is_type == type_name,
+             f'{name} has type {is_type.rpartition("/")[2]}, not {type_name}')
     if len(words) > 2:
         _fill(message(), yaml.safe_load(words[2]))
 

@@ -5,13 +5,14 @@ The viewers are not Python packages, so their files are compared with the requir
 readers.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 import json
 from pathlib import Path
 import re
 from typing import Any
 from xml.etree import ElementTree
 
+from documents import services_by_name, topics_by_name
 import pytest
 import yaml
 
@@ -40,24 +41,6 @@ FOXGLOVE_PANELS = {
     'Publish': {'topicName', 'datatype', 'value', 'advancedView'},
     'CallService': {'serviceName', 'requestPayload', 'layout'}}
 PLOT_STYLES = {'Lines', 'Dots', 'LinesAndDots', 'Sticks', 'Steps', 'StepsInv'}
-
-
-def by_name() -> Mapping[str, topics.Topic]:
-    """Return the topics by full name, for one joint without namespace."""
-    found = {}
-    for topic in vars(topics).values():
-        if isinstance(topic, topics.Topic):
-            for node in (*topic.publishers, *topic.subscribers):
-                name = topics.from_outside(topic.name, node)
-                found[name if name.startswith('/') else f'/{name}'] = topic
-    return found
-
-
-def services() -> Mapping[str, topics.Service]:
-    """Return the services by full name."""
-    return {f'/{topics.from_outside(service.name, node)}': service
-            for service in vars(topics).values()
-            if isinstance(service, topics.Service) for node in service.meaning}
 
 
 def field(type_name: str, path: str) -> None:
@@ -147,7 +130,7 @@ def test_foxglove_layout_has_each_panel_once_in_its_place():
 
 
 def test_foxglove_shows_topics_and_fields_that_there_are():
-    known = by_name()
+    known = topics_by_name()
     for name, config in FOXGLOVE['configById'].items():
         kind = name.partition('!')[0]
         if kind == '3D':
@@ -169,11 +152,11 @@ def test_foxglove_shows_topics_and_fields_that_there_are():
 def test_foxglove_publishes_and_calls_what_the_planner_takes():
     publish = FOXGLOVE['configById']['Publish!setpoint']
     assert publish['topicName'] == '/planner/setpoint'
-    topic = by_name()[publish['topicName']]
+    topic = topics_by_name()[publish['topicName']]
     assert publish['datatype'] == topic.type
     assert interface_class(topic.type)(**json.loads(publish['value'])).data > 0.0
     call = FOXGLOVE['configById']['CallService!stop']
-    request = interface_class(services()[call['serviceName']].type).Request
+    request = interface_class(services_by_name()[call['serviceName']].type).Request
     assert json.loads(call['requestPayload']) == {}
     assert request.get_fields_and_field_types() == {}
 
@@ -201,7 +184,7 @@ def test_plotjuggler_file_has_what_plotjuggler_reads():
 
 
 def test_plotjuggler_shows_topics_and_fields_that_there_are():
-    known = by_name()
+    known = topics_by_name()
     names = []
     for curve in PLOTJUGGLER.iter('curve'):
         names += [curve.attrib['curve_x'], curve.attrib['curve_y']] \
