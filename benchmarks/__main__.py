@@ -15,13 +15,12 @@ soak runs for hours. feedback moves actuators that differ from the planner's mod
 for about three minutes. identification fits thousands of simulated runs; defects fits those of
 actuators that deviate from the model. harm compares feedback with open loop in random
 laboratories, for half an hour. laboratory tunes laboratories behind a serial board, for a quarter
-of an hour; line makes cables, boards, amplifiers and sensors fail there, for two minutes. studies
-kills the workers of a study. rates measures how many plans per second studies compute, for about
-seven minutes. lockstep compares the kernel of batches with C. continuum plays commands on finite
-elements, for eight minutes; compressible compares a compressible block with them, for three;
-predictions compares what plans predict there, for two; waves measures the amplitude of waves
-there, for five; beam plays commands on an exact rod, for three; beam-identification identifies
-recordings of this rod, for five.
+of an hour; line makes cables, boards, amplifiers and sensors fail there, for two minutes. rates
+measures how many plans per second studies compute, for about seven minutes. lockstep compares the
+kernel of batches with C. continuum plays commands on finite elements, for eight minutes;
+compressible compares a compressible block with them, for three; predictions compares what plans
+predict there, for two; waves measures the amplitude of waves there, for five; beam plays commands
+on an exact rod, for three; beam-identification identifies recordings of this rod, for five.
 repeats plays what `hmsa learn` makes of repeats on finite elements and an exact rod, for half an
 hour.
 modes identifies secondary modes from recordings of these elements, for half an hour. adapting
@@ -63,7 +62,7 @@ TABLES |= {
         'identification.speed', 'identification.robustness', 'identification.compare'),
     'defects': ('defects.compare',), 'harm': ('harm.compare',),
     'laboratory': ('laboratory.compare',), 'line': ('line.compare',),
-    'studies': ('studies.compare',), 'rates': ('studies.rates',),
+    'rates': ('studies.rates',),
     'lockstep': ('studies.lockstep',),
     'continuum': ('continuum.compare', 'continuum.little_damped'),
     'compressible': ('compressible.compare',), 'predictions': ('continuum.predicted',),

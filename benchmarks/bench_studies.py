@@ -1,28 +1,21 @@
 """
-Measure what studies lose when workers are killed, and their rate on a cluster.
+Measure the rate of studies on processes and on a cluster.
 
-    python -m benchmarks studies [--quick]
     python -m benchmarks rates [--minutes M] [--quick]
     python -m benchmarks lockstep [--quick]
 
-A study runs on two processes. Twenty times, after some chunks are complete, one of its workers is
-killed with SIGKILL; the table is compared with that of an undisturbed run. The rates are those of
-the batch kernel alone on one core, and of studies on two processes and on a Dask cluster of two.
-Lock-step compares that kernel with itself, one move at a time, and with the same method in C, on
-one core.
+The rates are those of the batch kernel alone on one core, and of studies on two processes and on a
+Dask cluster of two. Lock-step compares that kernel with itself, one move at a time, and with the
+same method in C, on one core.
 """
 
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, nullcontext
 from functools import partial
 import math
-import multiprocessing
 import os
 from pathlib import Path
-import random
-import signal
 import tempfile
-import threading
-from time import perf_counter, process_time, sleep
+from time import perf_counter, process_time
 
 import numpy as np
 
@@ -36,21 +29,6 @@ from hmsa_studies.sweep import parse_grid, Sweep
 
 WORKERS = 2
 PROCESSES = partial(local_processes, WORKERS)
-# Maximum number of chunks completed between two kills.
-_BETWEEN = 6
-
-
-class Watched:
-    """A sweep that creates a file for each chunk it starts."""
-
-    def __init__(self, sweep, log):
-        self._sweep, self._log = sweep, log
-        self.size, self.digest, self.named = sweep.size, sweep.digest, sweep.named
-
-    def table(self, begin, end):
-        """Compute a chunk."""
-        (self._log / f'{begin}-{os.getpid()}').touch()
-        return self._sweep.table(begin, end)
 
 
 def grid(points):
@@ -58,58 +36,6 @@ def grid(points):
     return Sweep({
         'zeta': parse_grid('0:1.5:1000', 'zeta'),
         'j_lim': parse_grid(f'4:9:{points // 1000}', 'j_lim')})
-
-
-class Killer(threading.Thread):
-    """Kill random workers a number of times, each some chunks after the last."""
-
-    def __init__(self, kills, folder):
-        super().__init__(daemon=True)
-        self._left, self._folder = kills, folder
-        self.killed = 0
-
-    def run(self):
-        """Kill until the count is reached."""
-        dice = random.Random(1)
-        while self._left:
-            aim = len(self._folder.found()) + dice.randint(1, _BETWEEN)
-            while len(self._folder.found()) < aim:
-                sleep(0.02)
-            sleep(dice.uniform(0.0, 0.3))
-            with suppress(IndexError, ProcessLookupError):
-                os.kill(dice.choice(multiprocessing.active_children()).pid, signal.SIGKILL)
-                self.killed += 1
-                self._left -= 1
-
-
-def compare(*, quick):
-    """Kill workers at random; passed if the table is complete."""
-    kills = 2 if quick else 20
-    # More chunks than the kills can wait for.
-    sweep = grid(LEAST_ROWS * (kills + 1) * _BETWEEN)
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        tables = []
-        for words in ('quiet', 'killed'):
-            log = folder / f'{words} log'
-            log.mkdir()
-            chunks = StudyFolder(Watched(sweep, log), folder / words)
-            killer = Killer(kills if words == 'killed' else 0, chunks)
-            killer.start()
-            begin = perf_counter()
-            chunks.compute(PROCESSES, say=lambda _: None)
-            spent = perf_counter() - begin
-            chunks.merge(folder / f'{words}.parquet')
-            tables.append((folder / f'{words}.parquet').read_bytes())
-            again = len(list(log.iterdir())) - chunks.count
-    same = tables[0] == tables[1]
-    return Sheet(
-        'studies', f'A study on {WORKERS} processes whose workers are killed',
-        ['kills', 'chunks', 'begun again', 'at most', 'table', 'time'],
-        [[str(killer.killed), str(chunks.count), str(again), str(WORKERS * killer.killed),
-          'the same to the byte' if same else 'another', f'{spent:.0f} s']],
-        {'kills': killer.killed, 'chunks': chunks.count, 'begun_again': again, 'same': same},
-        same and killer.killed == kills and again <= WORKERS * kills)
 
 
 def rates(*, quick, minutes=math.inf):
