@@ -88,7 +88,7 @@ def test_a_database_without_definitions_uses_those_of_its_distribution(tmp_path,
     assert len(list(BagReader(folder).messages())) == len(STAMPS)
 
 
-def test_a_bag_of_ros1_is_read_and_not_rewritten(tmp_path, capsys):
+def test_a_bag_of_ros1_is_read_and_not_rewritten(tmp_path, capsys, refusal):
     path = tmp_path / 'run.bag'
     with rosbag1.Writer(path) as writer:
         connection = writer.add_connection('/joint_states', KIND, typestore=NOETIC)
@@ -99,13 +99,13 @@ def test_a_bag_of_ros1_is_read_and_not_rewritten(tmp_path, capsys):
     assert main(['bag', 'info', str(path), '--json']) == 0
     topic, = json.loads(capsys.readouterr().out)['topics']
     assert (topic['type'], topic['count']) == (KIND, len(STAMPS))
-    assert main(['bag', 'recover', str(path), '--out', str(tmp_path / 'new')]) == 2
-    assert f'convert it with "rosbags-convert --src {path}' in capsys.readouterr().err
+    assert f'convert it with "rosbags-convert --src {path}' in refusal(
+        'bag recover', path, '--out', tmp_path / 'new')
     with pytest.raises(BadInputError, match=r'such as .*run\.bag'):
         BagReader(tmp_path)
 
 
-def test_a_damaged_database_is_read_up_to_the_damage(tmp_path, capsys):
+def test_a_damaged_database_is_read_up_to_the_damage(tmp_path, capsys, refusal):
     writer = rosbag2.Writer(tmp_path / 'bag', version=8)
     with writer:
         connection = writer.add_connection('/a', 'std_msgs/msg/String', typestore=STORE)
@@ -122,8 +122,7 @@ def test_a_damaged_database_is_read_up_to_the_damage(tmp_path, capsys):
     assert 'malformed: the rest is skipped' in capsys.readouterr().err
     assert [x.log_time for x in BagReader(tmp_path / 'new').messages()] == list(range(5))
     path.write_bytes(intact[:len(intact) // 2])
-    assert main(['bag', 'info', str(path.parent)]) == 2
-    assert 'malformed' in capsys.readouterr().err
+    assert 'malformed' in refusal('bag info', path.parent)
 
 
 def test_what_a_killed_recorder_left_beside_a_database_is_said(tmp_path, capsys):

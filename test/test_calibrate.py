@@ -46,16 +46,17 @@ def test_the_constant_is_right_to_a_fifth_of_a_percent_in_nearly_all_runs(satura
             assert x.saturation == pytest.approx(saturation, rel=0.02)
 
 
-def test_readings_in_mt_without_a_unit_are_refused(tmp_path, capsys):
+def test_readings_in_mt_without_a_unit_are_refused(tmp_path, refusal):
     source = tmp_path / 'readings.csv'
     source.write_text('current,flux_density\n0,0\n1,50\n2,99\n3,148\n')
-    assert main(['calibrate', 'coil', str(source)]) == 2
-    assert 'readings.csv has flux densities up to 148 T: expected' in capsys.readouterr().err
+    assert 'readings.csv has flux densities up to 148 T: expected' in refusal(
+        'calibrate coil', source)
     with pytest.raises(BadInputError, match='write "flux_density'):
         CoilModel(file=str(source))
 
 
-def test_currents_in_ma_without_a_unit_are_refused_as_readings_and_by_the_driver(tmp_path, capsys):
+def test_currents_in_ma_without_a_unit_are_refused_as_readings_and_by_the_driver(
+        tmp_path, refusal):
     source = tmp_path / 'readings.csv'
 
     def write(unit, factor):
@@ -63,8 +64,7 @@ def test_currents_in_ma_without_a_unit_are_refused_as_readings_and_by_the_driver
             f'{factor * x:g},{0.05 * x:g}\n' for x in (-2.0, -1.0, 0.0, 1.0, 2.0)))
 
     write('', 1e3)
-    assert main(['calibrate', 'coil', str(source)]) == 2
-    assert 'has currents up to 2000 without a unit: expected' in capsys.readouterr().err
+    assert 'has currents up to 2000 without a unit: expected' in refusal('calibrate coil', source)
     with pytest.raises(BadInputError, match=r'write "current \[mA\]" in its header, or "curr'):
         CoilModel(file=str(source))
     for unit, factor, current in ((' [mA]', 1e3, 1.0), ('', 1.0, 1.0), (' [A]', 1e3, 1000.0)):
@@ -73,15 +73,14 @@ def test_currents_in_ma_without_a_unit_are_refused_as_readings_and_by_the_driver
         assert CoilModel(file=str(source)).current(0.05) == pytest.approx(current)
 
 
-def test_a_missing_reading_is_refused_with_its_line(tmp_path, capsys):
+def test_a_missing_reading_is_refused_with_its_line(tmp_path, refusal):
     source = tmp_path / 'readings.csv'
     source.write_text('current,flux_density\n0,0\n1,\n2,0.1\n3,0.15\n')
-    assert main(['calibrate', 'coil', str(source)]) == 2
-    assert 'readings.csv line 3 has no number for current or flux_density' in (
-        capsys.readouterr().err)
+    assert 'readings.csv line 3 has no number for current or flux_density' in refusal(
+        'calibrate coil', source)
 
 
-def test_a_coil_like_no_model_gets_a_table_that_the_driver_takes(tmp_path, capsys):
+def test_a_coil_like_no_model_gets_a_table_that_the_driver_takes(tmp_path, capsys, refusal):
     source, out = tmp_path / 'readings.csv', tmp_path / 'coil.yaml'
     flux = 0.05 * LOOP + 0.02 * np.maximum(LOOP, 0.0)
 
@@ -94,8 +93,7 @@ def test_a_coil_like_no_model_gets_a_table_that_the_driver_takes(tmp_path, capsy
     write(0.05 * LOOP)
     assert main(beside) == 0
     write(flux)
-    assert main(beside) == 2
-    assert f'cannot write {source}: the command reads it' in capsys.readouterr().err
+    assert f'cannot write {source}: the command reads it' in refusal('', *beside)
     assert main(['calibrate', 'coil', str(source), '--out', str(out)]) == 0
     assert 'table' in capsys.readouterr().out
     settings = {x.removeprefix('hardware.coil.'): y for _, x, y in entries_of(out)}
@@ -191,8 +189,7 @@ def test_an_interrupt_leaves_the_coil_off(monkeypatch):
     (('bench_under_test:coil', '--probe', 'bench_under_test:nothing'), '--probe'),
     (('bench_under_test:coil', '--limit', '0'), '--limit'), (('missing.csv',), 'missing.csv'),
     (('.',), 'cannot be read (Is a directory)')])
-def test_what_cannot_be_calibrated_is_refused(words, what, monkeypatch, capsys):
+def test_what_cannot_be_calibrated_is_refused(words, what, monkeypatch, refusal):
     monkeypatch.setitem(sys.modules, 'bench_under_test', sys.modules[__name__])
-    assert main(['calibrate', 'coil', *words]) == 2
-    assert what in capsys.readouterr().err
+    assert what in refusal('calibrate coil', *words)
     assert Supply.amperes == 0.0
