@@ -262,17 +262,6 @@ def test_a_refused_request_leaves_plan_and_outbox_alone(name, when):
 # -- pre-emption --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize('zeta', [0.0, 0.2, 1.1])
-@pytest.mark.parametrize('wait', [0.3, 1.7, 3.1, 4.4, 5.6, 20.0])
-@pytest.mark.parametrize('target', [1.05, 1.25, 0.8])
-def test_pre_emption_in_the_middle_of_a_move_leaves_no_vibration(zeta, wait, target):
-    rig = Rig(zeta=zeta, lead_time=1 * MS)
-    rig.setpoint(1.2)
-    rig.wait(wait)
-    rig.setpoint(target)
-    rig.rest(40, target)
-
-
 def test_the_prediction_is_continuous_across_a_pre_emption():
     rig = Rig(lead_time=3 * MS)
     rig.setpoint(1.3)
