@@ -36,6 +36,7 @@ from hmsa.planning.shapers import get_shaper
 from hmsa.planning.shapers.request import MoveRequest
 from hmsa.planning.two_step import Groups, plan_two_step, plan_two_step_batch
 from hmsa.runs.parameters import read_parameter_file, recorded
+from hmsa.runs.record import write_table
 
 mpmath = needs('mpmath')
 
@@ -294,20 +295,25 @@ def test_a_plan_as_json_has_null_for_a_chain_limit_that_there_is_not(tmp_path, c
     assert json.loads(capsys.readouterr().out)['j_lim'] is None
 
 
-def test_identification_scales_a_law_and_keeps_the_ratios_of_its_constants(tmp_path):
-    true = block('ogden')
+def record(true, targets, dwell, path):
+    """Write a recording of unshaped steps with noise to a file; return it as arrays."""
     unit, group = true.flux_density_unit, true.nondimensional
-    begins = np.array([0.0, *(0.02 + 0.05 * np.arange(9))])
-    levels = np.array([0.0, *(float(elastic_force(x, group)) * unit for x in (1.1, 1.4, 1.0) * 3)])
-    times = np.arange(500) * 1e-3
+    begins = np.append(0.0, 0.02 + dwell * np.arange(3 * len(targets)))
+    levels = np.append(0.0, np.tile(elastic_force(np.array(targets), group), 3) * unit)
+    times = np.arange(round((begins[-1] + dwell) * 1e3)) * 1e-3
     stretch, _ = simulate(
         begins / true.time_unit, levels / unit, times / true.time_unit, group)
     noisy = stretch + 1e-4 * np.random.default_rng(2).standard_normal(len(times))
+    write_table(path, {
+        'time': times, 'stretch': noisy,
+        'flux_density': levels[np.searchsorted(begins, times, 'right') - 1]})
+    return times, noisy, begins, levels
+
+
+def test_identification_scales_a_law_and_keeps_the_ratios_of_its_constants(tmp_path):
+    true = block('ogden')
     data, known, made = tmp_path / 'data.csv', tmp_path / 'known.yaml', tmp_path / 'found.yaml'
-    level = levels[np.searchsorted(begins, times, 'right') - 1]
-    data.write_text('time,stretch,flux_density\n' + ''.join(
-        f'{t!r},{x!r},{b!r}\n' for t, x, b in zip(
-            times.tolist(), noisy.tolist(), level.tolist(), strict=True)))
+    arrays = record(true, (1.1, 1.4, 1.0), 0.05, data)
     known.write_text(
         '/**:\n  ros__parameters:\n    law.name: ogden\n    law.mu: [7200.0, -1800.0, 12.0]\n'
         '    law.alpha: [1.5, -3.0, 8.0]\n')
@@ -317,5 +323,4 @@ def test_identification_scales_a_law_and_keeps_the_ratios_of_its_constants(tmp_p
     assert found.shear_modulus == pytest.approx(true.shear_modulus, rel=2e-3)
     assert parameters_of(found)['law.mu'] == pytest.approx([6e3, -1500.0, 10.0], rel=2e-3)
     with pytest.raises(BadInputError, match='chain_limit is free: expected none for law ogden'):
-        identify(
-            Measurement(times, noisy, begins, levels), free=('chain_limit',), actuator=true)
+        identify(Measurement(*arrays), free=('chain_limit',), actuator=true)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad, solve_ivp
 from scipy.interpolate import CubicSpline, make_interp_spline
+from test_core_laws import record
 
 from hmsa.cli import main
 from hmsa.errors import BadInputError
@@ -268,17 +269,7 @@ def test_a_plan_and_an_identification_take_a_table_from_a_parameter_file(tmp_pat
     true = actuator_from(
         {x.name: x.default for x in BLOCK} | {'actuator.density': 2100.0} | {
             'actuator.damping_coefficient': 0.5})
-    unit, group = true.flux_density_unit, true.nondimensional
-    begins = np.array([0.0, *(0.02 + 0.06 * np.arange(9))])
-    levels = np.array([0.0, *(
-        float(elastic_force(x, group)) * unit for x in (1.1, 1.25, 1.0) * 3)])
-    times = np.arange(560) * 1e-3
-    moved, _ = simulate(begins / true.time_unit, levels / unit, times / true.time_unit, group)
-    moved = moved + 1e-4 * np.random.default_rng(2).standard_normal(len(times))
-    level = levels[np.searchsorted(begins, times, 'right') - 1]
-    data.write_text('time,stretch,flux_density\n' + ''.join(
-        f'{t!r},{x!r},{b!r}\n' for t, x, b in zip(
-            times.tolist(), moved.tolist(), level.tolist(), strict=True)))
+    record(true, (1.1, 1.25, 1.0), 0.06, data)
     assert main([
         'identify', str(data), '--params-file', str(known), '--out', str(made), '--free',
         'density,damping_coefficient,stretch_bias']) == 0
