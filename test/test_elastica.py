@@ -8,6 +8,7 @@ from beam_oracle import silicone
 import numpy as np
 import pytest
 from scipy.integrate import solve_bvp
+from test_continuum import rest_by_modal
 
 from benchmarks.beam_rod import FIRST, Rod
 from hmsa import Actuator
@@ -16,11 +17,10 @@ from hmsa.errors import BadInputError
 from hmsa.interfaces.actuator import parameters_of
 from hmsa.model import equations, law
 from hmsa.model.continuum import clamped
-from hmsa.model.creep import Creep
 from hmsa.model.delivery import Delivery
 from hmsa.model.laws import elastica
 from hmsa.model.moves import Level, State
-from hmsa.model.simulation import follow, observed, sampled
+from hmsa.model.simulation import observed, sampled
 from hmsa.model.status import Code
 from hmsa.planning.shapers import get_shaper
 from hmsa.planning.shapers.request import MoveRequest
@@ -173,26 +173,12 @@ def test_modal_takes_at_most_1_3_times_as_long_as_two_steps_to_any_bent_state():
             assert move.duration <= 1.3 * two.duration
 
 
-@pytest.mark.parametrize(('delivery', 'creep'), [
-    (Delivery(), Creep()), (Delivery(period=0.05), Creep()), (Delivery(slew=6.0), Creep()),
-    (Delivery(lag=0.1), Creep()), (Delivery(period=0.04, slew=8.0, lag=0.05), Creep())],
-    ids=['ideal', 'grid', 'ramps', 'lag', 'all'])
-def test_modal_brings_both_modes_of_a_beam_to_rest_from_rest_and_from_motion(delivery, creep):
-    material = replace(beam(0.05), creep=creep)
-    shape, state, random = get_shaper('modal'), State(0.0), np.random.default_rng(3)
-    for i, target in enumerate(random.uniform(-0.7, 0.7, 12).tolist()):
-        request = MoveRequest(state, target, material, delivery=delivery)
-        move = shape(request)
-        end = follow(move.levels, request.start, move.duration, material, delivery)
-        assert [end.stretch, end.followed[-2]] == pytest.approx([target] * 2, abs=1e-8)
-        assert [end.rate, end.followed[-1]] == pytest.approx([0.0] * 2, abs=1e-7)
-        if i % 2:
-            half = 0.6 * move.duration
-            state = follow(
-                [x for x in move.levels if x.time < half], request.start, half, material,
-                delivery)
-        else:
-            state = State(target)
+@pytest.mark.parametrize('delivery', [
+    Delivery(), Delivery(period=0.05), Delivery(slew=6.0), Delivery(lag=0.1),
+    Delivery(period=0.04, slew=8.0, lag=0.05)], ids=['ideal', 'grid', 'ramps', 'lag', 'all'])
+def test_modal_brings_both_modes_of_a_beam_to_rest_from_rest_and_from_motion(delivery):
+    rest_by_modal(
+        beam(0.05), 0.0, np.random.default_rng(3).uniform(-0.7, 0.7, 12), 1e-8, delivery)
 
 
 # -- parameters ---------------------------------------------------------------------------------
