@@ -10,7 +10,7 @@ import pytest
 
 from hmsa.bag import metadata, qos
 from hmsa.bag.definitions import message_definition, type_hash
-from hmsa.bag.info import summarize
+from hmsa.bag.info import summarize, to_text
 from hmsa.bag.reader import BagReader, read_messages
 from hmsa.bag.writer import BagTopic, BagWriter, parse_custom_data, PRESETS
 from hmsa.errors import BadInputError, BagError
@@ -257,9 +257,12 @@ def test_custom_data_are_pairs():
 
 def test_a_summary_tells_counts_rates_and_losses(tmp_path):
     folder = write_bag(tmp_path / 'bag', range(0, 10**9 + 1, 10**8),
-                       custom_data={'lost': '{"/a": 3}', 'plant.use_sim_time': 'true'})
+                       custom_data={'lost': '{"/a": 3}', 'sent_before': '{"/a": 1}',
+                                    'plant.use_sim_time': 'true'})
     summary = summarize(folder)
     assert summary.lost == 3
+    assert ('complete  yes, except 3 messages that its recorder lost and 1 message sent before '
+            'the recorder was matched') in to_text(summary)
     assert summary.duration == pytest.approx(1.0)
     assert summary.topics[0].rate == pytest.approx(10.0)
     assert summary.parameters == {'plant.use_sim_time': 'true'}

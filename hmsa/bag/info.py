@@ -161,10 +161,12 @@ def _lines(
     yield f'bag       {summary.path}'
     for name, size in summary.files:
         yield f'file      {name}  {size / 1024:.1f} KiB'
-    late = (f', except {_messages(summary.sent_before)} sent before the recorder was matched'
-            if summary.sent_before else '')
+    without = [f'{_messages(count)} {what}' for count, what in (
+        (summary.lost, 'that its recorder lost'),
+        (summary.sent_before, 'sent before the recorder was matched')) if count]
     yield 'complete  ' + (
-        f'yes{late}' if summary.complete else f'no: {summary.missing(())}; see hmsa bag recover')
+        f'yes{", except " if without else ""}{" and ".join(without)}' if summary.complete
+        else f'no: {summary.missing(())}; see hmsa bag recover')
     if summary.start_ns is not None:
         yield f'start     {_time(summary.start_ns)}'
     yield f'duration  {summary.duration:.3f} s'
