@@ -73,8 +73,10 @@ class MissingWarning(UserWarning):
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Return the known name closest to another one, however far it is."""
-    return get_close_matches(name[:_LONGEST_NAME], list(known), 1, 0.0)[0]
+    """Return the known names that end in another one, or else the closest, however far it is."""
+    names = sorted(set(known))
+    same = [x for x in names if x.rpartition('.')[2] == name]
+    return listed(same or get_close_matches(name[:_LONGEST_NAME], names, 1, 0.0))
 
 
 def meant(word: object, known: Iterable[str]) -> str:

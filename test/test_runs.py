@@ -235,6 +235,8 @@ def test_a_parameter_file_sets_what_a_node_has_above_what_all_have(tmp_path):
      "'actuator.half_lenght' does not exist: .* such as actuator.half_length"),
     ('/**: {ros__parameters: {half_length: 0.005, actuator.remanence: 0.1}}',
      "'half_length' does not exist: .* such as actuator.half_length"),
+    ('/**: {ros__parameters: {shear_modulus: 1e4, actuator.remanence: 0.1}}',
+     'such as actuator.shear_modulus, mismatch.shear_modulus, thermal.shear_modulus$'),
     ('actuator: {zeta: 0.1, remanence: 0.1}', "'actuator.zeta' does not exist"),
     ('planner: {ros__parameters: {flux_max: 0.3, actuator.remanence: 0.1}}',
      "'flux_max' does not exist: .* such as flux_density_max"),

@@ -218,9 +218,8 @@ def _check_names(path: Path, entries: Entries) -> None:
             '.' in rest or rest in known) else name
         if own in known or own.partition('.')[0] in shared.FOREIGN or first in shared.FOREIGN:
             continue
-        group = f'{own.partition(".")[0]}.' if '.' in own else (
-            'actuator.' * (own in shared.ACTUATOR_FIELDS))
-        near = [x for x in sorted(known) if x.startswith(group)] or known
+        group = f'{own.partition(".")[0]}.' if '.' in own else ''
+        near = [x for x in known if x.startswith(group)] or known
         raise BadInputError(
             f'{path}: parameter {excerpt(name)} does not exist: expected one of planner and '
             f'plant, such as {nearest(own, near)}')
