@@ -325,6 +325,30 @@ def test_long_trajectory_is_planned_beside_the_loop_with_signs_of_life_in_betwee
     assert rig.runtime.deviations.lateness.count == 0
 
 
+def test_a_pause_of_the_machine_hardly_delays_what_is_being_planned(monkeypatch):
+    rig = Rig()
+    checks = []
+
+    def pause(job):
+        checks.append(job)
+        # Once the request has been read.
+        if len(checks) == 12:
+            rig.now += LEAD
+            rig.steady += LEAD
+        usual(job)
+    usual = Sliced._pause
+    monkeypatch.setattr(Sliced, '_pause', pause)
+    plan = rig.planner.plan
+    rig.effort = MS // 100
+    rig.runtime.request(zigzag(1000))
+    while rig.planner.plan is plan:
+        rig.tick()
+        rig.now += MS
+    begin = rig.planner.plan.segments[-1000].since
+    assert rig.now < begin < START + 5_000 * MS
+    assert f'accepted; begins {(begin - rig.now) / 1e9:.1f} s later' in rig.status.verdict.message
+
+
 def test_stop_is_answered_at_once_whatever_is_planned():
     rig = Rig()
     rig.go(trajectory(*SEQUENCE), START + LEAD + 3 * MS)

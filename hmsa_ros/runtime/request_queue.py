@@ -39,6 +39,11 @@ SLICE = 4_000_000
 _READ = 100
 # Factor by which planning may take longer next time than estimated or measured.
 _MARGIN = 3
+# Fraction of the work, as 1 over it, from which its time is estimated: a pause of the machine
+# counts as at most so many. Planning that begins again has lost at most this fraction.
+_TRIAL = 20
+# Time in ns until a request begins above which its status says so.
+_SOON = NANOSECONDS
 # Factor of the planning time until the first commands are sent.
 _READY = 1.5
 _INLINE = Inline()
@@ -245,6 +250,9 @@ class RequestQueue:
                 'has acknowledged it')
         if severity is Severity.OK and not plans:
             code, words = Code.UNCHANGED, 'already on the way there: the plan is unchanged'
+        until = min((x.begin for x in drafts.values()), default=0) - self._around.clock()
+        if isinstance(request, Trajectory) and request.stamp is None and until > _SOON:
+            words = f'{words}; begins {until / NANOSECONDS:.2g} s later, since planning takes time'
         if self.temperatures.joints and (why := self.temperatures.words()):
             words = f'{words}; {why}'
         self._reporting.give(
@@ -338,7 +346,8 @@ def _bounded(
             check()
             done += 1
             spent = steady() - begun
-            if 2 * spent > lead + 2 * later and spent * size > (lead + later) * done:
+            if _TRIAL * done >= size and 2 * spent > lead + 2 * later \
+                    and spent * size > (lead + later) * done:
                 raise _LateError(spent * size // done)
         return draft(counted)
     return drafted
