@@ -1,5 +1,6 @@
 """Raw messages taken from subscriptions, and their simulated timestamps."""
 
+from ctypes import memmove
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,7 @@ from std_msgs.msg import Float64
 
 from hmsa.bag.writer_thread import RecordedTopic
 from hmsa_ros.nodes import recorder
-from hmsa_ros.nodes.capture import Capture, RawSubscription, SimulatedTime
+from hmsa_ros.nodes.capture import _Taker, Buffer, Capture, RawSubscription, SimulatedTime
 from hmsa_ros.nodes.selection import Selection
 
 TALKER = Path(__file__).parent / 'talker.py'
@@ -33,6 +34,22 @@ def test_messages_are_taken_with_stamps_and_numbers(ros, start, wait_until):
     assert all(0 <= message.received_ns - message.source_ns < 60e9 for message in got)
     assert {len(message.publisher) for message in got} == {16}
     assert len({message.publisher for message in got}) == 1
+
+
+def test_what_comes_without_a_payload_is_no_message():
+    taker, whole = _Taker(), b'\0\1\0\0message'
+    payloads = [b'', whole]
+
+    def take(pointer, array, info, allocation):
+        if not payloads:
+            return 1
+        data = payloads.pop(0)
+        buffer = Buffer.from_address(array)
+        memmove(buffer.buffer, data, len(data))
+        buffer.length = len(data)
+        return 0
+    taker._take = take
+    assert [x.data for x in taker.take(0, 10)] == [whole]
 
 
 @pytest.mark.ros

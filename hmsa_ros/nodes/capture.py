@@ -120,9 +120,12 @@ class _Taker:
         take, string_at, array, info = self._take, ctypes.string_at, self._array, self._info
         array_at, info_at = ctypes.addressof(array), ctypes.addressof(info)
         while len(result) < limit and take(pointer, array_at, info_at, None) == 0:
-            result.append(Taken(
-                info.source, info.received, info.sequence, bytes(info.publisher),
-                string_at(array.buffer, array.length)))
+            # On a busy machine, Fast DDS has passed on a message of many fragments without payload
+            # and timestamps before the whole one. Every payload begins with its encoding.
+            if array.length:
+                result.append(Taken(
+                    info.source, info.received, info.sequence, bytes(info.publisher),
+                    string_at(array.buffer, array.length)))
         return result
 
 
