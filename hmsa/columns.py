@@ -195,7 +195,7 @@ def read_table(
         raise BadInputError(
             f'{path} has no column {" and no column ".join(missing)}: expected '
             f'{", ".join(wanted)}; its columns are {excerpt(", ".join(cells))}'
-            + (_of_another(cells) if 'stretch' in missing else ''))
+            + (_of_another(cells, rest_length) if 'stretch' in missing else ''))
     below = _units_below(path, rows, separator, places)
     factors = {name: _factor(path, x, below.get(name, ''), rest_length)
                for name, x in places.items()}
@@ -346,8 +346,10 @@ def _factor(path: Path, place: _Place, below: str, rest_length: float | None) ->
     raise BadInputError(f'{path} gives {place.name} in {unit}: expected {expected}')
 
 
-def _of_another(cells: list[str]) -> str:
+def _of_another(cells: list[str], rest_length: float | None) -> str:
     """Return how to obtain a stretch from the columns of a file without one."""
+    if rest_length is not None:
+        return '; with a length at rest, call the column of lengths length [mm]'
     names = ' '.join(cells).lower()
     if 'strain' in names:
         return '; stretch is strain' + ' in percent over 100' * ('%' in names) + ' plus 1'

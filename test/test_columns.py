@@ -144,6 +144,12 @@ def test_another_unit_is_refused_with_what_to_do(csv, text, message):
         read_table(csv(text), wanted)
 
 
+def test_lengths_under_another_name_are_refused_with_the_name_that_counts(csv):
+    with pytest.raises(
+            BadInputError, match=r'no column stretch.*call the column of lengths length \[mm\]$'):
+        read_table(csv('time,height [mm]\n0,20\n'), ('time', 'stretch'), rest_length=0.02)
+
+
 def test_only_who_wants_currents_of_a_coil_judges_them(csv):
     path = csv('current,flux_density\n-2000,-0.1\n0,0\n2000,0.1\n')
     assert read_table(path, ('current', 'flux_density')).columns['current'][-1] == 2000.0
