@@ -32,8 +32,8 @@ from hmsa_ros.nodes.temporary_node import ServiceCall, SLICE_SECONDS
 # Time in s for an existing planner node to subscribe: configuration takes a fraction of a second,
 # much longer on a busy machine.
 _LISTENS_SECONDS = 60.0
-# Time in s until a request without an answer is sent again: a planner that has just discovered
-# this client may not have received it.
+# Time in s until a request without an answer is sent again, doubled each time: a planner that has
+# just discovered this client may not have received it.
 _AGAIN_SECONDS = 1.0
 # Time in s until a subscriber that is in the graph but not matched counts as unreachable.
 _MATCHED_SECONDS = 3.0
@@ -76,9 +76,9 @@ class PlannerClient(Link):
         self._begun: float | None = None  # time at which the planner's subscription was found
         #: Name of the last request.
         self.requested = ''
-        # The request, and the time in s at which it is sent again without an answer.
+        # The request, and when and after which time in s it is sent again without an answer.
         self._message: Any = None
-        self._again = math.inf
+        self._again, self._pause = math.inf, _AGAIN_SECONDS
 
     def find_planner(self, each: Callable[[], None] | None = None) -> None:
         """Wait until a planner subscribes and its status has arrived; call ``each`` meanwhile."""
@@ -297,13 +297,15 @@ class PlannerClient(Link):
             [(x, round(time * NANOSECONDS)) for time, x in points], self._joints,
             frame=self.requested, raw=bool(levels), path=bool(path))
         self._publisher.publish(self._message)
-        self._again = monotonic() + _AGAIN_SECONDS
+        self._pause = _AGAIN_SECONDS
+        self._again = monotonic() + self._pause
         return self.requested
 
     def send_again(self) -> None:
         """Send the last request again when due; the planner carries it out once."""
         if monotonic() > self._again:
-            self._again = monotonic() + _AGAIN_SECONDS
+            self._pause *= 2.0
+            self._again = monotonic() + self._pause
             self._publisher.publish(self._message)
 
     def pace(self) -> float:
