@@ -12,6 +12,7 @@ from scipy.integrate import solve_ivp
 
 from benchmarks.block_elements import Block
 from hmsa.cli import main
+from hmsa.errors import BadInputError
 from hmsa.identification import modal
 from hmsa.identification.diagnosis import cost, frequency_of, misfit, unexplained
 from hmsa.identification.excitation import Bounds, excite
@@ -314,6 +315,18 @@ def test_without_modes_none_is_found():
     assert found.verdict == 'identified', found.reason
     assert not found.modes
     assert found.parameters['mass_factor'].value == pytest.approx(1.3, rel=1e-3)
+
+
+def test_values_of_no_actuator_beside_residuals_are_rejected(monkeypatch):
+    usual = sys.modules['hmsa.identification.diagnosis']._USUAL
+    monkeypatch.setitem(usual, 'remanence', (0.2, 0.3, -2))
+    with pytest.raises(BadInputError, match='corresponds to a remanence'):
+        identify(recorded(BLOCK), actuator=BLOCK)
+    # As of a glued block, whose statics are not those of uniform deformation.
+    found = identify(
+        recorded(TRUE), (*(x for x in DEFAULT_FREE if x != 'chain_limit'), 'stretch_gain'),
+        actuator=BLOCK)
+    assert found.verdict == 'model_rejected'
 
 
 @pytest.mark.parametrize(('extras', 'words'), [

@@ -357,8 +357,13 @@ def distant(fit: Fit, found: Whiteness) -> bool:
         float(found.autocorrelation[1])) > 0.2
 
 
-def check_plausible(fit: Fit, unknown: Collection[str]) -> None:
-    """Raise `BadInputError` for values that indicate data in other units."""
+def implausible(fit: Fit, found: Whiteness, unknown: Collection[str]) -> str:
+    """
+    Return which value no actuator has; empty if there is none.
+
+    Raise `BadInputError` if the data are in other units: the model then leaves only noise, or
+    usual units make the value that of an actuator.
+    """
     recording = fit.recording
     modulus, ratio = quantities.modulus_of(fit.values.get('law'))
     for name, (least, most, power) in _USUAL.items():
@@ -374,11 +379,15 @@ def check_plausible(fit: Fit, unknown: Collection[str]) -> None:
             hint = '; if flux densities are in mT, ' + remedy(
                 'flux_density', 'mT', recording.from_csv)
         unit = quantities.QUANTITIES[name].unit
-        raise BadInputError(
+        words = (
             f'the motion in {recording.label} corresponds to a {label} of {value:.3g} {unit}, '
             f'with samples {recording.gap:.3g} s apart: expected {least:g} to '
             f'{most:g} {unit}; check that times are in s, flux densities in T, and the size of '
             f'the actuator in its parameter file{hint}')
+        if hint or found.white:
+            raise BadInputError(words)
+        return words
+    return ''
 
 
 def _opposed(recording: Measurement) -> str:

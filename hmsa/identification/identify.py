@@ -333,10 +333,9 @@ def _conclude(
     lost, weak = (set(best.free) if distant and not modes else set(), '') \
         if distant or named else diagnosis.weakness(best, known.deviation, known.proved)
     still = set() if lost else unmoved(best)
-    if not distant and not others and not still:
-        diagnosis.check_plausible(best, lost)
+    strange = '' if distant or others or still else diagnosis.implausible(best, found, lost)
     verdict: IdentificationVerdict = 'model_rejected'
-    reason = diagnosis.misfit(best, found, marks, alike)
+    reason = diagnosis.misfit(best, found, marks, alike) or strange
     if weak:
         # Errors of the model widen all intervals, and may be why nothing is determined.
         verdict = 'not_identifiable'
