@@ -11,6 +11,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from benchmarks.block_elements import Block
+from hmsa import Actuator
 from hmsa.cli import main
 from hmsa.errors import BadInputError
 from hmsa.identification import modal
@@ -229,7 +230,10 @@ def test_modes_that_explain_nearly_all_residuals_are_named_whatever_their_interv
     assert found.signatures[0].remedy == MODES
 
 
-def test_close_modes_that_change_with_the_stretch_are_no_single_one_of_more_damping():
+def test_close_modes_that_change_with_the_stretch_are_no_single_one_of_more_damping(monkeypatch):
+    # As of a block whose modes are not computed.
+    monkeypatch.setattr(
+        sys.modules['hmsa.identification.identify'], 'as_computed', lambda *_: None)
     known = replace(BLOCK, damping_coefficient=0.25)
     found = identify(recorded(replace(known, mass_factor=1.2, modes=Modes(
         (1.7, 2.1), (0.12, 0.12), (0.05, 0.06), (0.4, 0.4), (-2.0, 1.5))), count=5),
@@ -308,6 +312,24 @@ def test_residuals_of_shaped_moves_stand_for_twice_as_much_vibration():
         found = fit(recording, values_of(BLOCK), ('remanence', *SECONDARY[0]), most=3)
         factors.append(cost(found, (), None) / unexplained(found))
     assert factors[1] == pytest.approx(2.0 * factors[0])
+
+
+def test_modes_of_a_block_that_change_with_the_stretch_are_the_computed_ones():
+    flat = Actuator(half_thickness=3e-3, damping_ratio=0.04)
+    block = flat.replace(mount='free').block
+    true = replace(block, remanence=0.11)
+    found = identify(recorded(true, count=5), WITH_MODES, actuator=flat.block)
+    assert found.verdict == 'identified', found.reason
+    # Fitted modes that do not change would leave more than noise.
+    assert found.whiteness.white
+    assert found.actuator.modes.share_exponents == block.modes.share_exponents
+    assert found.actuator.modes.ratios[2] == block.modes.ratios[2]
+    values = values_of(true)
+    for name in found.names:
+        x = found.parameters[name]
+        assert abs(x.value - values[name]) < 4.0 * x.std, name
+    assert any('computed for a block' in x for x in found.warnings)
+    assert 'times the first) with' in found.modes[0].words
 
 
 def test_without_modes_none_is_found():

@@ -25,6 +25,7 @@ from hmsa.identification.initial_guess import begins_at_rest
 from hmsa.identification.intervals import estimates_of, Precision, precision_of, stamp_error
 from hmsa.identification.measurement import Measurement
 from hmsa.identification.modal import (
+    as_computed,
     BESIDES,
     contested,
     ENOUGH,
@@ -187,23 +188,32 @@ def _with_modes(
     def concluded(best: Fit) -> Identification:
         return _conclude(*_with_errors_of_stamps(best), [], tried, agreed, given, limit, one)
 
-    best = narrower(one, start, together, limit, actuator.modes.numbers)
-    found = concluded(best)
-    # J_lim, what nobody asked for, and where a broad mode is keep their values where errors of the
-    # modes hide them.
-    usual = {'chain_limit': limit} | {x: y for x, (y, _) in BESIDES.items() if x not in free} | {
-        x[0]: best.values[x[0]] for x in quantities.modes_of(best.values)
-        if best.values[x[2]] >= BROAD}
-    while found.verdict == 'not_identifiable' and (hidden := {
-            x: y for x, y in usual.items()
-            if x in best.free and math.isnan(found.parameters[x].value)}):
-        less = fit(
-            _keeping(best.recording, limit) if 'chain_limit' in hidden else best.recording,
-            {**best.values, **hidden}, tuple(x for x in best.free if x not in hidden))
-        if less is None or not possible(less):
-            break
-        best, found = less, concluded(less)
-    return found
+    def determined(best: Fit) -> Identification:
+        found = concluded(best)
+        # J_lim, what nobody asked for, where a broad mode is, and shares of computed modes keep
+        # their values where errors of the modes hide them.
+        modes = quantities.modes_of(best.values)
+        usual = {'chain_limit': limit} | {
+            x: y for x, (y, _) in BESIDES.items() if x not in free} | {
+            x[0]: best.values[x[0]] for x in modes if best.values[x[2]] >= BROAD} | {
+            x[1]: best.values[x[1]] for x in modes if x[0] not in best.free}
+        while found.verdict == 'not_identifiable' and (hidden := {
+                x: y for x, y in usual.items()
+                if x in best.free and math.isnan(found.parameters[x].value)}):
+            less = fit(
+                _keeping(best.recording, limit) if 'chain_limit' in hidden else best.recording,
+                {**best.values, **hidden}, tuple(x for x in best.free if x not in hidden))
+            if less is None or not possible(less):
+                break
+            best, found = less, concluded(less)
+        return found
+
+    own = actuator.modes.numbers
+    best = narrower(one, start, together, limit, own)
+    told = as_computed(best, one, start, together, limit, own)
+    if told is not None and (found := determined(told)).verdict == 'identified':
+        return found
+    return determined(best)
 
 
 def _challenged(
@@ -436,6 +446,9 @@ def _warnings(
             found.append(
                 'mass_factor is free in place of shear_modulus, of which the motion shows only '
                 f'their ratio: it is for {best.values["shear_modulus"]:.6g} Pa')
+        if any(best.values[x] for names in quantities.SECONDARY for x in names[3:]):
+            found.append(
+                'modes change with the stretch as computed for a block of this shape, or as given')
         if not known.whiteness.white:
             left = 100.0 * diagnosis.unexplained(best)
             found.append(

@@ -26,6 +26,7 @@ from hmsa.identification.quantities import MODES, SECONDARY
 from hmsa.identification.response import ResponseArguments
 from hmsa.identification.result import Mode
 from hmsa.model import equations
+from hmsa.model.continuum import mounted, SHAPES
 from hmsa.model.equations import Array
 from hmsa.model.laws.record import BEAMS
 from hmsa.model.modes import BROAD
@@ -75,6 +76,9 @@ _NEAR, _NEAR_FIRST = 1.122, 1.06
 _OF_BEAMS = 2.5
 # Relative change of the force by J_lim that is noticeable.
 _STIFFENS = 0.04
+# Residuals in units of those of fitted modes up to which computed ones are preferred: on finite
+# elements, they have 0.7 to 1.7 (benchmarks continuum). Least share of a strong mode.
+_ALIKE, _STRONG = 2.0, 0.04
 # Lines in place of other parameters, and the fraction of what these explain below which modes are
 # no rival: they explain all of it in 50 simulations with modes, and 0.65 in one with a lag, creep
 # and a force.
@@ -352,12 +356,7 @@ def with_modes(
     best = fit(recording, start, free, most=_FIRST) or one
     own = frequency_of(best)
     highest, lowest = highest_ratio(recording, own), _lowest(best.values)
-    wide, values = tuple(free), dict(best.values)
-    if values['law'] is None or not values['law'].section:
-        wide = tuple(dict.fromkeys((*(x for x in free if x != 'chain_limit'), *BESIDES)))
-        values |= {x: begin for x, (usual, begin) in BESIDES.items() if values[x] == usual}
-        if 'chain_limit' in free:
-            values['chain_limit'] = min(limit, _LOOSE)
+    wide, values = _widened(best, free, limit)
     damping = _damping_ratio(values)
     for i, names in enumerate(SECONDARY[:most]):
         begins = [(x.ratio, x.damping) for x in lines_of(best, own, 2)]
@@ -385,6 +384,69 @@ def with_modes(
             # Modes with dampings of their own explain all but noise; so may further ones.
             best, wide, values, viscous = freed, freed.free, freed.values, False
     return _completed(best, free) if quantities.modes_of(best.values) else best
+
+
+def _widened(
+        best: Fit, free: Sequence[str], limit: float) -> tuple[tuple[str, ...], dict[str, Any]]:
+    """Return what to free besides modes, and the values at which to begin."""
+    wide, values = tuple(free), dict(best.values)
+    if values['law'] is None or not values['law'].section:
+        wide = tuple(dict.fromkeys((*(x for x in free if x != 'chain_limit'), *BESIDES)))
+        values |= {x: begin for x, (usual, begin) in BESIDES.items() if values[x] == usual}
+        if 'chain_limit' in free:
+            values['chain_limit'] = min(limit, _LOOSE)
+    return wide, values
+
+
+def as_computed(
+        best: Fit, one: Fit, start: Mapping[str, Any], free: Sequence[str], limit: float,
+        given: Sequence[Sequence[float]]) -> Fit | None:
+    """
+    Return a fit with the computed modes of a block; None if it leaves far more than the best one.
+
+    How their ratios and shares change with the stretch is that of the parameter file or of a block
+    that is free or glued, whichever is nearest; shares are free, and ratios of strong modes. Of
+    fitted modes that leave more than noise, several stand for one that changes, or one for many
+    weak ones, and plans that bring these to rest leave more (benchmarks continuum). Other
+    arguments are those of `with_modes`.
+    """
+    values = best.values
+    shape = values['half_thickness'] / values['half_length']
+    if (values['law'] is not None or not SHAPES[0] <= shape <= SHAPES[1]
+            or whiteness(best.root * best.residual).white):
+        return None
+    wide, values = _widened(fit(one.recording, start, free, most=_FIRST) or one, free, limit)
+    damping = max(_damping_ratio(values), _DAMPED[0])
+    blocks = [mounted(shape, x, values['chain_limit'], damping, values['bulk_ratio'])
+              for x in ('free', 'glued')]
+    begins = [{
+        'transverse_mass_factor': x.transverse_mass_factor,
+        'transverse_mass_exponent': x.transverse_mass_exponent, **_named(x.modes.numbers)}
+        for x in blocks]
+    begins += [_named(given)] if given else []
+    kept = [x for x in wide if x != 'transverse_mass_factor']
+    alike = [y for x in begins if (
+        y := fit(one.recording, {**values, **x}, kept, most=_FULL)) is not None]
+    if not alike:
+        return None
+    values = min(alike, key=lambda x: loss(x.residual, best.scale)).values
+    modes = quantities.modes_of(values)
+    found = fit(one.recording, values, (*wide, *(x[1] for x in modes)), most=_FULL)
+    if found is None:
+        return None
+    # A recording shows where a mode is only if it is strong and rings.
+    strong = [x[0] for x in modes
+              if found.values[x[1]] > _STRONG and found.values[x[2]] < BROAD]
+    found = fit(one.recording, found.values, (*found.free, *strong), most=_FULL) or found
+    found = _completed(_viscous(found), free)
+    return found if possible(found) and (
+        unexplained(found) < _ALIKE * unexplained(best)) else None
+
+
+def _named(modes: Sequence[Sequence[float]]) -> dict[str, float]:
+    """Return the values of modes by name, from numbers as `Modes.numbers`."""
+    return {x: y for names, numbers in zip(SECONDARY, modes, strict=False)
+            for x, y in zip(names, numbers, strict=True)}
 
 
 def narrower(
@@ -422,8 +484,10 @@ def _viscous(found: Fit) -> Fit:
     for _ in range(_REPEATS):
         values, damping = found.values, max(_damping_ratio(found.values), _DAMPED[0])
         fast = math.inf if _of_beam(values) else _FAST
-        dampings = {x[2]: min(damping * values[x[0]], BROAD) if values[x[0]] < fast else BROAD
-                    for x in quantities.modes_of(values)}
+        dampings = {
+            x[2]: min(damping * values[x[0]], BROAD)
+            if values[x[0]] < fast and values[x[2]] < BROAD else BROAD
+            for x in quantities.modes_of(values)}
         found = fit(found.recording, {**values, **dampings}, found.free, most=_FULL) or found
     return found
 
@@ -464,7 +528,7 @@ def possible(found: Fit) -> bool:
     """Return whether the modes of a fit are those of an actuator."""
     values = found.values
     modes = quantities.modes_of(values)
-    ratios = sorted((1.0, *(values[x[0]] for x in modes)))
+    ratios = sorted((1.0, *(values[x[0]] for x in modes if values[x[2]] < BROAD)))
     if len(ratios) > 1 and ratios[1] < _lowest(values):
         return False
     return all(y > (_NEAR_FIRST if x == 1.0 else _NEAR) * x for x, y in pairwise(ratios)) and sum(

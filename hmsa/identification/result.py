@@ -104,10 +104,11 @@ class Mode:
         """Description."""
         value, low, high = self.ratio
         share, least, most = (100.0 * x for x in self.share)
+        ends = f', {low:.3g} to {high:.3g}' if high > low else ''
         return (
             f'{"a second mode" if self.number == 2 else f"mode {self.number}"} at '
-            f'{self.frequency:.4g} Hz ({value:.3g} times the first, {low:.3g} to {high:.3g}) with '
-            f'a share of {share:.3g} % ({least:.2g} to {most:.2g} %)')
+            f'{self.frequency:.4g} Hz ({value:.3g} times the first{ends}) with a share of '
+            f'{share:.3g} % ({least:.2g} to {most:.2g} %)')
 
 
 @dataclass(frozen=True, eq=False)
