@@ -491,6 +491,14 @@ def test_a_saturated_amplifier_is_neither_learnt_from_nor_asked_for_more(shown):
     assert it.planner.model.actuator.shear_modulus == 1e4
 
 
+def test_samples_of_another_actuator_correct_nothing_if_its_field_differs():
+    it = bench(False, lead=2 * MS, report=False)
+    it.effort = lambda: 1.5 * field_of(it, it.now)
+    it.sense = lambda time, x: [(time, 1.0 + 1.5 * (x - 1.0))]
+    assert np.max(np.abs(moves(it, (1.15, 1.3)))) < 0.1
+    assert 'corrected' not in it.codes()
+
+
 @pytest.mark.parametrize('later', [4, -4])
 def test_a_field_measured_before_or_after_the_stretch_is_no_fault_of_the_coil(later):
     # By a tenth of the time scale; samples arrive 2 ms after their timestamps.

@@ -118,7 +118,7 @@ class AdaptiveJoint:
     _sensor: tuple[StateEstimate, SensorModel] | None = None  # estimate, and its sensor
     _measured: bool = False  # whether the field is measured
     _thermometer: float = field(init=False)  # the newest measured temperature in use
-    _differs: int | None = None  # timestamp since which the field differs; None if it does not
+    differs_since: int | None = None  # timestamp since which the field differs; None if not
     sensor_changed: bool = False  # whether the estimator allows for any bias and gain
     reverts: bool = False  # whether the plan is to be reverted to the given parameters
     _bias: tuple[float, float] = 0.0, 0.0  # of the sensor as confirmed, and its deviation
@@ -274,13 +274,13 @@ class AdaptiveJoint:
         if not plan.segments or not self._measured or stamp < level.stamp + follows and known or (
                 abs(field - wanted) <= max(
                     _OFF * max(abs(field), abs(wanted)), _LEAST * units.load)):
-            if self._differs is not None and not self.lost:
-                self.mismatch = max(self.mismatch, stamp - self._differs)
-            self._differs = None
+            if self.differs_since is not None and not self.lost:
+                self.mismatch = max(self.mismatch, stamp - self.differs_since)
+            self.differs_since = None
             return ''
-        if self._differs is None:
-            self._differs = stamp
-        if stamp < self._differs + follows:
+        if self.differs_since is None:
+            self.differs_since = stamp
+        if stamp < self.differs_since + follows:
             return self.lost
         return (
             f'the coil has {flux_text(field)} where {flux_text(wanted)} were commanded'
