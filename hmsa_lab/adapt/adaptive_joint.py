@@ -350,8 +350,8 @@ class AdaptiveJoint:
         if found is not None and (trust.why or lacks):
             found = replace(found, trusted=False, trouble=trust.why or _LACKS)
         self.latest, self.news = found, True
+        trust.rang &= self.fitting is None
         if self.adapts and self.acting is not None:
-            trust.rang = False
             self._take_temperature(self.acting.values[TEMPERATURE], now)
         elif trust.kept is None:
             self.take_measured(now)
