@@ -1,13 +1,14 @@
 """One joint under feedback: its estimate, and how plans use it."""
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, InitVar, replace
 from functools import partial
 import math
+from typing import Any
 
 from hmsa.errors import HmsaError
-from hmsa.identification.quantities import Known, TEMPERATURE
+from hmsa.identification.quantities import coordinates, Known, TEMPERATURE, THERMAL
 from hmsa.judge.records import SensorModel
 from hmsa.judge.setpoint_samples import SetpointSamples
 from hmsa.model.equations import equilibrium_stretch
@@ -57,6 +58,9 @@ _OFF, _LEAST, _FOLLOWED = 0.05, 0.01, 3.0
 # Log odds from which the sensor counts as changed, and part of the possible log odds against a
 # change from which it counts as before; a drift of 1e-2 a second reaches 0.73.
 _JUMPED, _AS_BEFORE = 2.0, 0.8
+# Part of the negative log probability of learnt parameters that others may have which replace
+# them: a remanence 8 % in error leaves 0.56 of it once the gain of the sensor falls by 2 %.
+_NEARER = 0.5
 # Number of samples kept to be explained anew.
 _KEPT = 600
 # Difference in K of an estimated temperature that plans follow; 2e-4 of a level.
@@ -416,8 +420,9 @@ class AdaptiveJoint:
             trust.recover(given=False)
             self._restart(self.estimator.since, healthy=True)
             return True
-        if not differences(found, self.prior.values) and differences(
-                found, self._as_identified(trust.confirmed or self.given).values):
+        learnt = self._as_identified(trust.confirmed or self.given).values
+        if differences(found, learnt) and self._unlikely(found.values) < _NEARER * self._unlikely(
+                {**learnt, **{x: found.values[x] for x in ('stretch_bias', *THERMAL)}}):
             # Samples need neither what was learnt nor another sensor.
             trust.recover(given=True)
             self.used = self.given
@@ -428,6 +433,13 @@ class AdaptiveJoint:
             trust.wait(now)
             self._restart(self.estimator.since)
         return False
+
+    def _unlikely(self, values: Mapping[str, Any]) -> float:
+        """Return the negative log probability of values before any sample, up to a constant."""
+        prior = self.prior
+        off = (coordinates(values, prior.free) - coordinates(
+            prior.values, prior.free)) / prior.spread
+        return 0.5 * float(off @ off)
 
     @property
     def _learnt(self) -> bool:
