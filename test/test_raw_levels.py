@@ -13,6 +13,7 @@ import pytest
 from hmsa.identification.excitation import Bounds, excite
 from hmsa.identification.measurement import read_levels
 from hmsa.model.status import Code, RefusedError
+from hmsa.planning.history import Deviation
 from hmsa.planning.planner import Options, Planner
 
 SECOND = 1_000_000_000
@@ -68,6 +69,18 @@ def test_ramps_of_the_amplifier_are_part_of_the_prediction():
     assert np.all(np.diff(times) > 0.0)
     assert plan.levels[-1].at(plan.segments[0].arrival + SECOND // 10).stretch == pytest.approx(
         1.0, abs=1e-6)
+
+
+def test_reports_of_levels_as_planned_leave_the_plan_as_it_is():
+    planner = Planner(BLOCK, Options(lead_time=SECOND // 10))
+    points = [(level_of(1.1 + 0.1 * (i % 2)), i * SECOND // 100) for i in range(50)]
+    plan = planner.take(planner.draft_levels(points, None, SECOND), SECOND)
+    for level in planner.due(SECOND + SECOND // 20):
+        deviation = planner.applied(level.stamp, level.flux_density, 0)
+        assert deviation == Deviation()
+        assert planner.plan is plan
+        assert planner.unknown(level.stamp)[0] is level
+    assert not planner.awaiting
 
 
 @pytest.mark.parametrize(('levels', 'options', 'code', 'words'), [

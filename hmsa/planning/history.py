@@ -111,6 +111,9 @@ class History:
         # The level as the hardware rounds it.
         news = replace(taken, stamp=stamp, flux_density=flux_density)
         deviation = replace(deviation, change=flux_density - levels[known].flux_density)
+        if rest == known + 2 and news == levels[known + 1]:
+            # As planned: the work does not grow with the plan.
+            return replace(self, known=known + 1).predicted(self.sent), deviation
         after = levels[rest:self.sent]
         if after and after[0].stamp < stamp:
             after = tuple(
