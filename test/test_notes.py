@@ -72,6 +72,20 @@ def test_a_section_for_another_node_is_not_used_and_said(here, capsys):
     assert (belief.actuator.remanence, belief.actuator.half_length) == (0.11, 0.02)
 
 
+def test_parameters_of_single_joints_are_not_used_for_one_actuator_and_said(here, capsys):
+    (here / 'it.yaml').write_text(
+        '/**: {ros__parameters: {joints: [left, right], actuator.remanence: 0.11,\n'
+        '  left.actuator.remanence: 0.12, right: {flux_density_max: 0.3}, record.topics: [it]}}\n',
+        encoding='utf-8')
+    for words in (COMMANDS['wave'], ['plan', '1.01:1']):
+        assert main([*words, '--params-file', 'it.yaml']) == 0
+        assert quick(capsys.readouterr().err) == (
+            'hmsa: note: it.yaml: parameters of left, right are not used, only those of all '
+            'joints: expected those of one actuator; write a file for each\n')
+    with pytest.warns(AssumedWarning, match='parameters of left, right are not used'):
+        assert read_belief(here / 'it.yaml').actuator.remanence == 0.11
+
+
 def test_sections_for_several_namespaces_are_said(here):
     (here / 'it.yaml').write_text(
         '/left/planner: {ros__parameters: {actuator.remanence: 0.11}}\n'

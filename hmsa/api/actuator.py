@@ -46,7 +46,7 @@ from hmsa.planning.sequence import plan_sequence
 from hmsa.planning.shapers import get_shaper
 from hmsa.planning.shapers.request import as_errors, ERRORS, MoveRequest, SmoothLimits
 from hmsa.planning.timeline import JointModel
-from hmsa.runs.parameters import read_parameter_file
+from hmsa.runs.parameters import assume_one_joint, entries_of, read_parameter_file
 from hmsa.table import Column, Table
 
 if TYPE_CHECKING:
@@ -199,8 +199,11 @@ class Actuator:
 
         """
         path = file_of(path, 'the path of a YAML file')
+        entries = entries_of(path)
+        assume_one_joint(path, entries)
         return cls.from_parameters(
-            {name.partition('.')[2]: value for name, value in read_parameter_file(path).items()
+            {name.partition('.')[2]: value
+             for name, value in read_parameter_file(path, entries).items()
              if name.startswith(f'{PLANNER}.')}, path)
 
     @classmethod

@@ -26,7 +26,7 @@ from hmsa.interfaces.topics import PLANNER, PLANT
 from hmsa.model.creep import CONSTANTS, Flow, FLOWS, MAXWELL
 from hmsa.model.parameters import ActuatorParameters, Ellipsoid, Uncertainty
 from hmsa.planning.shapers.request import as_errors, LARGEST_ERROR
-from hmsa.runs.parameters import Entries, entries_of, values_of
+from hmsa.runs.parameters import assume_one_joint, Entries, entries_of, values_of
 
 if TYPE_CHECKING:  # slow to import, and not needed by nodes
     from hmsa.identification.result import Identification
@@ -92,6 +92,7 @@ def read_belief(path: Path | None, entries: Entries | None = None) -> Belief:
     # Parameters of a node override those for all nodes, and the planner's those of the plant.
     if entries is None:
         entries = [] if path is None else entries_of(path)
+    assume_one_joint(path, entries)
     settings: dict[str, Any] = {
         name: value for _, name, value in sorted(entries, key=lambda x: _RANKS.get(x[0], 0))}
     values = values_of({f'{PLANNER}.{x}': y for x, y in settings.items()}, PLANNER, BLOCK)

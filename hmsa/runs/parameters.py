@@ -207,16 +207,33 @@ def entries_of(path: Path) -> Entries:
     return entries
 
 
-def _check_names(path: Path, entries: Entries) -> None:
-    """Raise `BadInputError` for a name that no node has; those for others are not looked at."""
+def assume_one_joint(path: Path | None, entries: Entries) -> None:
+    """State that parameters of single joints are not used where one actuator is wanted."""
+    known = _KNOWN | shared.PLAIN_NAMES
+    if single := dict.fromkeys(
+            joint for _, joint, own in _of_joints(entries) if joint and own in known):
+        assume(
+            f'{path or "the parameter file"}: parameters of {", ".join(single)} are not used, '
+            'only those of all joints: expected those of one actuator; write a file for each')
+
+
+def _of_joints(entries: Entries) -> Iterator[tuple[str, str, str]]:
+    """Yield the name of each parameter, its joint, empty for all, and its name without that."""
     joints = [x for _, name, value in entries if name == 'joints' and isinstance(value, list)
               for x in value]
     known = _KNOWN | shared.PLAIN_NAMES
     for _, name, _ in entries:
         first, _, rest = name.partition('.')
-        own = rest if first in joints or first not in _GROUPS and (
-            '.' in rest or rest in known) else name
-        if own in known or own.partition('.')[0] in shared.FOREIGN or first in shared.FOREIGN:
+        single = first in joints or first not in _GROUPS | shared.FOREIGN and (
+            '.' in rest or rest in known)
+        yield (name, first, rest) if single else (name, '', name)
+
+
+def _check_names(path: Path, entries: Entries) -> None:
+    """Raise `BadInputError` for a name that no node has; those for others are not looked at."""
+    known = _KNOWN | shared.PLAIN_NAMES
+    for name, _, own in _of_joints(entries):
+        if own in known or own.partition('.')[0] in shared.FOREIGN:
             continue
         group = f'{own.partition(".")[0]}.' if '.' in own else ''
         near = [x for x in known if x.startswith(group)] or known
