@@ -32,11 +32,18 @@ from hmsa.judge.records import Tolerances
 from hmsa.model.creep import Creep
 from hmsa.model.parameters import NondimensionalParameters, paper_actuator
 from hmsa.model.simulation import ActuatorSimulation, residual_vibration, simulate
+from hmsa.model.status import Code
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.planner import Options, Planner
 from hmsa.report.charts import MOST_PANELS
 from hmsa.report.comparison import Part
-from hmsa.report.evaluation import evaluate, findings_of, level_results, plan_points
+from hmsa.report.evaluation import (
+    evaluate,
+    findings_of,
+    judged_from,
+    level_results,
+    plan_points,
+)
 from hmsa.report.figures import BUCKETS, decimate
 from hmsa.report.page import page
 from hmsa.report.picture import draw
@@ -299,6 +306,24 @@ def test_a_path_is_one_setpoint_which_is_judged_from_its_end_on(part_of):
     finding, = part_of(simulated(path=path, extra=0.1)).evaluation.findings
     assert (str(finding.verdict), finding.setpoint.target) == ('arrived', 1.2)
     assert finding.setpoint.arrival == START + LEAD + end
+
+
+@pytest.mark.parametrize(('moved', 'settled', 'arrived', 'from_new'), [
+    (None, 0.09, True, False),
+    # Arrived as requested, before the plan was corrected; then only as corrected, or not.
+    (0.1, 0.001, True, False), (0.1, 0.09, True, True), (0.1, math.inf, False, True),
+    # A corrected plan that is faster.
+    (-1e-4, 0.001, True, False)])
+def test_a_corrected_setpoint_is_judged_from_the_plan_that_was_followed(
+        paper, moved, settled, arrived, from_new):
+    finding = paper.evaluation.findings[0]
+    asked = finding.setpoint
+    at = None if moved is None else asked.arrival + round(moved * 1e9)
+    finding = replace(
+        finding, setpoint=replace(asked, moved=at),
+        verdict=Code.ARRIVED if arrived else Code.VIBRATING)
+    begin = at if from_new else asked.arrival
+    assert judged_from(finding, settled) == (begin - asked.begins) / NANOSECONDS
 
 
 class Page(HTMLParser):

@@ -244,7 +244,8 @@ def _measured(part: Part, number: int) -> tuple[float | str, ...]:
     return (
         found.setpoint.target, *((math.nan,) * 3 if result is None else (
             1e3 * result.arrival, 1e3 * result.settled, 100.0 * result.residual)),
-        verdict_on(part.evaluation, number), 1e3 * judged_from(found),
+        verdict_on(part.evaluation, number),
+        1e3 * judged_from(found, math.inf if result is None else result.settled),
         *(found.setpoint.percent(x) for x in (
             found.offset, found.offset_std, found.vibration, found.vibration_std)))
 

@@ -249,9 +249,18 @@ class Evaluation:
         return (stamp - self.zero) / NANOSECONDS
 
 
-def judged_from(finding: Finding) -> float:
-    """Return the time of the first judged sample in s from the start of the move."""
-    return (finding.setpoint.rests_from - finding.setpoint.begins) / NANOSECONDS
+def judged_from(finding: Finding, settled: float) -> float:
+    """
+    Return the time of the first judged sample in s from the start of the move.
+
+    A setpoint that has not arrived, and settled, as requested is judged from the arrival of its
+    newest plan on.
+    """
+    setpoint = finding.setpoint
+    asked, moved = (math.nan if x is None else (x - setpoint.begins) / NANOSECONDS
+                    for x in (setpoint.rests_from, setpoint.moved))
+    followed = finding.arrived and not asked < min(moved, settled)
+    return asked if followed or math.isnan(moved) else moved
 
 
 def verdicts(evaluations: Sequence[Evaluation], number: int) -> str:
