@@ -32,6 +32,11 @@ def setpoint(**changes):
         'frequency': OMEGA, 'decay': DECAY, **changes})
 
 
+def test_a_fraction_of_a_tiny_step_is_a_plain_number():
+    assert setpoint(target=1.2008).words(0.00989) == '0.00989 (1236 %)'
+    assert setpoint().words(0.0101) == '0.0101 (5.05 %)'
+
+
 @pytest.mark.parametrize(('motion', 'verdict'), [
     ({}, 'arrived'), ({'noise': 0.3}, 'arrived'), ({'offset': 3.0}, 'off_target'),
     ({'vibration': 5.0}, 'vibrating'), ({'vibration': 1.0, 'noise': 0.1}, 'arrived')])

@@ -96,7 +96,7 @@ class RequestedSetpoint:
             return f'{difference:.3g}'
         if share < 100.0 * RESOLVED:
             return f'<{RESOLVED * self.step:.1g} ({percent(0.01 * share)} %)'
-        return f'{difference:.3g} ({share:.3g} %)'
+        return f'{difference:.3g} ({share:{".3g" if share < 999.5 else ".0f"}} %)'
 
 
 @dataclass(frozen=True)
