@@ -421,8 +421,10 @@ class AdaptiveJoint:
             self._restart(self.estimator.since, healthy=True)
             return True
         learnt = self._as_identified(trust.confirmed or self.given).values
-        if differences(found, learnt) and self._unlikely(found.values) < _NEARER * self._unlikely(
-                {**learnt, **{x: found.values[x] for x in ('stretch_bias', *THERMAL)}}):
+        if differences(found, learnt) and (
+                not differences(found, self.prior.values)
+                or self._unlikely(found.values) < _NEARER * self._unlikely(
+                    {**learnt, **{x: found.values[x] for x in ('stretch_bias', *THERMAL)}})):
             # Samples need neither what was learnt nor another sensor.
             trust.recover(given=True)
             self.used = self.given
