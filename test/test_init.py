@@ -214,6 +214,11 @@ def test_the_prefixes_of_a_million_and_a_thousandth_are_not_confused(text, unit)
         quantity_of(text, unit, 'it')
 
 
+def test_a_decimal_comma_is_refused_with_the_number_that_is_meant():
+    with pytest.raises(BadInputError, match=r"it is '0,8mm': expected .*, as in '0\.8mm'$"):
+        quantity_of('0,8mm', 'm', 'it')
+
+
 @pytest.mark.parametrize('size', ['length', 'thickness'])
 def test_a_size_is_given_once(run, size):
     status, _, err = run('--yes', f'--{size}', '1mm', f'--half-{size}', '1mm')

@@ -60,6 +60,9 @@ def quantity_of(text: str, unit: str, words: str) -> float:
         example = f' with or without a unit ({", ".join(units)})' if units else ''
         raise BadInputError(f'{words} is {text!r}: expected a number{example}')
     number, own = found[1], found[2].replace('\u03bc', 'µ')
+    if re.match(r',\d', own):
+        raise BadInputError(
+            f'{words} is {text!r}: expected a decimal point, as in {text.replace(",", ".", 1)!r}')
     if own not in units:
         # In another case, but not across the prefixes m (milli) and M (mega).
         own = next((x for x in units if x.lower() == own.lower() and not (
