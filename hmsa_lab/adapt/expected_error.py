@@ -42,8 +42,6 @@ _LEAST = 1e-4
 _STEP = 0.15
 # Time in ns of a level before the course, which the field has then reached.
 _LONG = 1000 * NANOSECONDS
-# Time constants of a coil after which its field has settled.
-_LAGS = 10.0
 # Noise, as a fraction of the step, up to which it is small.
 _QUIET = 0.004
 
@@ -114,10 +112,7 @@ def expect(
     time. If it ends before `until`, in ns, the decay of vibration until then counts.
     """
     begin = estimate.time
-    # A lagging coil shifts the motion, and has no effect after the field has settled.
-    lag = estimate.values['coil_time_constant'] + 2.0 * estimate.deviations.get(
-        'coil_time_constant', 0.0)
-    end = max(course.arrival, begin, until) + round(_LAGS * lag * NANOSECONDS)
+    end = max(course.arrival, begin, until)
     levels = course.levels
     if not math.isnan(course.before):
         # A first level at the time of the estimate is a step.
