@@ -115,6 +115,33 @@ class Busy(Node):
         sleep(0.005)
 sys.exit(run(Busy, []))
 """
+# A node that has received more messages than it reads in half a minute.
+BEHIND = """
+import sys
+from time import sleep
+from rclpy.node import Node
+from std_msgs.msg import Empty
+from hmsa_ros.nodes.managed import run
+class Behind(Node):
+    def __init__(self):
+        super().__init__('behind')
+        self.read = 0
+        self.create_subscription(Empty, 'topic', self.work, 3000)
+        self.sender = self.create_publisher(Empty, 'topic', 3000)
+        while not self.sender.get_subscription_count():
+            sleep(0.01)
+        self.sender.publish(Empty())
+    def work(self, _):
+        self.read += 1
+        if self.read == 1:
+            for _ in range(2999):
+                self.sender.publish(Empty())
+            print('behind', flush=True)
+        sleep(0.01)
+    def close(self):
+        print(self.read)
+sys.exit(run(Behind, []))
+"""
 
 
 @pytest.mark.parametrize(('arguments', 'status'), [
@@ -180,6 +207,15 @@ def test_a_node_that_is_always_busy_ends_on_a_signal(ros_env):
             assert node.stdout.readline() == b'busy\n'
         node.send_signal(signal.SIGTERM)
         node.stdout.read()
+        assert node.wait(60) == 0
+
+
+def test_a_node_ends_on_a_signal_before_it_has_read_what_it_received(ros_env):
+    with subprocess.Popen(
+            [sys.executable, '-c', BEHIND], stdout=subprocess.PIPE, env=ros_env) as node:
+        assert node.stdout.readline() == b'behind\n'
+        node.send_signal(signal.SIGTERM)
+        assert int(node.stdout.read()) < 3000
         assert node.wait(60) == 0
 
 

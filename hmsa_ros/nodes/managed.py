@@ -13,6 +13,7 @@ import inspect
 import os
 import re
 import sys
+import threading
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -58,7 +59,7 @@ AUTOSTART = ParameterSpec(
     '~/change_state (ros2 lifecycle set).')
 # On this rclpy (7.1), EventsExecutor.spin() without a time limit busy-loops and delivers nothing.
 # Waiting in slices for a future works as documented. With events always at hand, though, a slice
-# does not end in time: only a timer has its turn then.
+# does not end in time, and a timer has its turn after all events before it.
 _SLICE_SECONDS, _LOOK_SECONDS = 1.0, 0.1
 
 
@@ -363,22 +364,22 @@ def spin(nodes: Sequence[Node], ending: Callable[[], bool]) -> None:
     executor = EventsExecutor(context=context)
     for node in nodes:
         executor.add_node(node)
-    ended = Future()
+    ended, served = Future(), threading.Event()
 
     def look() -> None:
-        if ending() and not ended.done():
-            ended.set_result(None)
-    timer = nodes[0].create_timer(
-        _LOOK_SECONDS, look, clock=RclpyClock(clock_type=ClockType.STEADY_TIME))
-    # A managed node destroys what it has created since it was configured.
-    getattr(nodes[0], 'keep', lambda *entities: None)(timer)
+        while not (served.wait(_LOOK_SECONDS) or ended.done()):
+            if ending():
+                ended.set_result(None)
+    thread = threading.Thread(target=look, daemon=True)
+    thread.start()
     try:
         while context.ok() and not ended.done():
             executor.spin_until_future_complete(ended, _SLICE_SECONDS)
     except ExternalShutdownException:
         pass
     finally:
-        timer.cancel()
+        served.set()
+        thread.join()
         executor.shutdown()
 
 
