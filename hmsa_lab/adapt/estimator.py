@@ -45,7 +45,7 @@ _NOISE_GAIN = 0.05
 # 3e-4, gain, remanence and force become too certain.
 _BOUND, _DRIFT = 4.0, 1e-3
 # The same of a sensor: one that has drifted is then found as before (test_feedback_trust.py).
-_DRIFT_OF_SENSOR, _SENSED = 3e-3, ('stretch_bias', 'stretch_gain')
+_DRIFT_OF_SENSOR, _BIAS_AND_GAIN = 3e-3, ('stretch_bias', 'stretch_gain')
 # The same where the temperature is estimated.
 _SLOWER = 3e-4
 # Drift of the temperature in K in a second unless it is measured, and in a kelvin of measured
@@ -342,7 +342,7 @@ class Estimator:
         """Return the variance that parameters gain in some seconds, at most their spread's."""
         spread, free = self.prior.spread, self.prior.free
         # A change within minutes is one of the temperature, if that changes parameters.
-        rate = np.array([_DRIFT_OF_SENSOR if x in _SENSED else _DRIFT for x in free])
+        rate = np.array([_DRIFT_OF_SENSOR if x in _BIAS_AND_GAIN else _DRIFT for x in free])
         gained = (spread * (_SLOWER if TEMPERATURE in free else rate)) ** 2 * max(duration, 0.0)
         if TEMPERATURE in free:
             gained[free.index(TEMPERATURE)] = _BY_KELVIN ** 2 * abs(self._warmed) + (
