@@ -11,7 +11,7 @@ import pytest
 
 from hmsa import motion
 from hmsa.cli import main
-from hmsa.errors import BadInputError
+from hmsa.errors import AssumedWarning, BadInputError
 from hmsa.identification.files import read_belief
 from hmsa.identification.identify import identify
 from hmsa.identification.measurement import Measurement
@@ -283,7 +283,8 @@ def test_file_and_bag_with_the_former_name_of_the_parameter_are_read(tmp_path):
     assert read_parameter_file(file) == {
         f'{node}.{name}': value for node in ('planner', 'plant') for name, value in (
             ('law.name', 'neo_hookean'), ('left.law.name', 'yeoh'), ('law.c10', 1.0))}
-    assert read_belief(file).actuator.chain_limit == math.inf
+    with pytest.warns(AssumedWarning, match='parameters of left are not used'):
+        assert read_belief(file).actuator.chain_limit == math.inf
     stored = {'/plant.use_sim_time': 'false', '/plant.law': '"neo_hookean"'}
     assert recorded(stored, '/')['plant.law.name'] == 'neo_hookean'
 
