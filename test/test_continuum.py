@@ -309,6 +309,8 @@ def test_flat_glued_block_says_how_far_it_rests_from_its_targets(tmp_path, capsy
     assert main(['init', '--yes', '--half-thickness', '5mm', '--mount', 'glued', '--out',
                  str(tmp_path / 'actuator.yaml')]) == 0
     assert words in capsys.readouterr().err
+    assert ('    # Shear modulus G of the material, times the relative stiffness of a glued block '
+            '[Pa]') in (tmp_path / 'actuator.yaml').read_text()
 
 
 def test_mounted_block_rests_by_modal_and_rings_by_two_step():

@@ -140,7 +140,8 @@ def run(arguments: argparse.Namespace) -> int:
         *(f'#   hmsa {x} --ros-args --params-file {quote(path.name)}' for x in _NODES),
         '#', '# What follows from them (computed by hmsa init when it wrote this file):',
         *(f'#   {line}' for line in table), '/**:', '  ros__parameters:',
-        *_lines(form, parameters, {x.parameter or DAMPING.parameter for x in missing}),
+        *_lines(form, parameters, {x.parameter or DAMPING.parameter for x in missing},
+                glued=arguments.mount == 'glued'),
         *_joints(joints, made.block), *_sampling(made.block)]) + '\n')
     for doubt in doubts:
         print(f'hmsa: warning: {doubt}', file=sys.stderr)
@@ -227,7 +228,9 @@ def _actuator(
         return (Actuator.beam if form == 'beam' else Actuator)(**values)
 
 
-def _lines(form: str, parameters: Mapping[str, Any], guessed: Collection[str]) -> list[str]:
+def _lines(
+        form: str, parameters: Mapping[str, Any], guessed: Collection[str], *, glued: bool
+) -> list[str]:
     """Return the nodes' parameters in YAML, each below its description, which marks guesses."""
     texts = {x.name: (x.description.rstrip('.'), x.unit) for x in (*LAW, BULK_RATIO, *MODES)} | {
         x.parameter: (x.text, x.unit) for x in (*QUANTITIES, DAMPING)}
@@ -237,6 +240,11 @@ def _lines(form: str, parameters: Mapping[str, Any], guessed: Collection[str]) -
             for x in FORMS['beam']} | {
             LAW_NAME.name: ('a beam: positions are deflections of the tip over the length', ''),
             DAMPING.parameter: ('damping coefficient of the tip', DAMPING.unit)}
+    if glued:
+        name = 'actuator.shear_modulus'
+        text, unit = texts[name]
+        texts[name] = (
+            f'{text} of the material, times the relative stiffness of a glued block', unit)
     lines = []
     for name, value in parameters.items():
         text, unit = texts[name]
