@@ -231,7 +231,7 @@ def test_modes_that_explain_nearly_all_residuals_are_named_whatever_their_interv
 
 
 def test_close_modes_that_change_with_the_stretch_are_no_single_one_of_more_damping(monkeypatch):
-    # As of a block whose modes are not computed.
+    # With computed modes, a third one would be added, so broad that it stands for others.
     monkeypatch.setattr(
         sys.modules['hmsa.identification.identify'], 'as_computed', lambda *_: None)
     known = replace(BLOCK, damping_coefficient=0.25)
@@ -344,7 +344,7 @@ def test_values_of_no_actuator_beside_residuals_are_rejected(monkeypatch):
     monkeypatch.setitem(usual, 'remanence', (0.2, 0.3, -2))
     with pytest.raises(BadInputError, match='corresponds to a remanence'):
         identify(recorded(BLOCK), actuator=BLOCK)
-    # As of a glued block, whose statics are not those of uniform deformation.
+    # Fits to glued blocks, which do not deform uniformly, have led to such values.
     found = identify(
         recorded(TRUE), (*(x for x in DEFAULT_FREE if x != 'chain_limit'), 'stretch_gain'),
         actuator=BLOCK)

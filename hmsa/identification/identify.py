@@ -26,6 +26,7 @@ from hmsa.identification.intervals import estimates_of, Precision, precision_of,
 from hmsa.identification.measurement import Measurement
 from hmsa.identification.modal import (
     as_computed,
+    begun,
     BESIDES,
     contested,
     ENOUGH,
@@ -208,9 +209,9 @@ def _with_modes(
             best, found = less, concluded(less)
         return found
 
-    own = actuator.modes.numbers
-    best = narrower(one, start, together, limit, own)
-    told = as_computed(best, one, start, together, limit, own)
+    beginning = begun(one, start, together)
+    best = narrower(beginning, together, limit, actuator.modes.numbers)
+    told = as_computed(best, beginning, together, limit, actuator.modes)
     if told is not None and (found := determined(told)).verdict == 'identified':
         return found
     return determined(best)
@@ -434,7 +435,7 @@ def _with_others(one: Fit, limit: float, most: int) -> Fit:
         one = fit(one.recording, {
             **one.values, **{x[1]: 0.0 for x in quantities.SECONDARY}}, one.free) or one
     return with_modes(
-        one, one.values, one.free, limit, given, max(most, len(given) + 1))
+        begun(one, one.values, one.free), one.free, limit, given, max(most, len(given) + 1))
 
 
 def _warnings(

@@ -29,7 +29,7 @@ from hmsa.model import equations
 from hmsa.model.continuum import mounted, SHAPES
 from hmsa.model.equations import Array
 from hmsa.model.laws.record import BEAMS
-from hmsa.model.modes import BROAD
+from hmsa.model.modes import BROAD, Modes
 from hmsa.motion import derivatives
 
 #: Minimum ratio to the frequency of the first mode.
@@ -319,10 +319,14 @@ def rescaled(
             'remanence', 'damping_coefficient', 'mass_factor', 'constant_force') if x in free}}
 
 
+def begun(one: Fit, start: Mapping[str, Any], free: Sequence[str]) -> Fit:
+    """Return a fit of the first mode to begin with, from values, or else the one that is there."""
+    return fit(one.recording, start, free, most=_FIRST) or one
+
+
 def with_modes(
-        one: Fit, start: Mapping[str, Any], free: Sequence[str], limit: float,
-        given: Sequence[Sequence[float]] = (), most: int = len(SECONDARY), *,
-        viscous: bool = False) -> Fit:
+        best: Fit, free: Sequence[str], limit: float, given: Sequence[Sequence[float]] = (),
+        most: int = len(SECONDARY), *, viscous: bool = False) -> Fit:
     """
     Return the best fit with secondary modes, from one of the first mode alone.
 
@@ -330,10 +334,8 @@ def with_modes(
 
     Parameters
     ----------
-    one : Fit
-        The fit of the first mode.
-    start : mapping of str to float
-        Values at which to begin.
+    best : Fit
+        The fit of the first mode at which to begin; see `begun`.
     free : sequence of str
         What is free besides modes.
     limit : float
@@ -352,9 +354,7 @@ def with_modes(
         For a block, it may also free how frequency and damping change with the stretch.
 
     """
-    recording = one.recording
-    best = fit(recording, start, free, most=_FIRST) or one
-    own = frequency_of(best)
+    recording, own = best.recording, frequency_of(best)
     highest, lowest = highest_ratio(recording, own), _lowest(best.values)
     wide, values = _widened(best, free, limit)
     damping = _damping_ratio(values)
@@ -399,59 +399,51 @@ def _widened(
 
 
 def as_computed(
-        best: Fit, one: Fit, start: Mapping[str, Any], free: Sequence[str], limit: float,
-        given: Sequence[Sequence[float]]) -> Fit | None:
+        best: Fit, first: Fit, free: Sequence[str], limit: float, given: Modes) -> Fit | None:
     """
     Return a fit with the computed modes of a block; None if it leaves far more than the best one.
 
     How their ratios and shares change with the stretch is that of the parameter file or of a block
     that is free or glued, whichever is nearest; shares are free, and ratios of strong modes. Of
     fitted modes that leave more than noise, several stand for one that changes, or one for many
-    weak ones, and plans that bring these to rest leave more (benchmarks continuum). Other
-    arguments are those of `with_modes`.
+    weak ones, and plans that bring these to rest leave more (benchmarks continuum). ``first`` is
+    the fit of the first mode at which to begin, and other arguments are those of `with_modes`.
     """
     values = best.values
     shape = values['half_thickness'] / values['half_length']
     if (values['law'] is not None or not SHAPES[0] <= shape <= SHAPES[1]
             or whiteness(best.root * best.residual).white):
         return None
-    wide, values = _widened(fit(one.recording, start, free, most=_FIRST) or one, free, limit)
+    wide, values = _widened(first, free, limit)
     damping = max(_damping_ratio(values), _DAMPED[0])
     blocks = [mounted(shape, x, values['chain_limit'], damping, values['bulk_ratio'])
               for x in ('free', 'glued')]
     begins = [{
         'transverse_mass_factor': x.transverse_mass_factor,
-        'transverse_mass_exponent': x.transverse_mass_exponent, **_named(x.modes.numbers)}
-        for x in blocks]
-    begins += [_named(given)] if given else []
+        'transverse_mass_exponent': x.transverse_mass_exponent,
+        **quantities.values_of_modes(x.modes)} for x in blocks]
+    begins += [quantities.values_of_modes(given)] if given.ratios else []
     kept = [x for x in wide if x != 'transverse_mass_factor']
     alike = [y for x in begins if (
-        y := fit(one.recording, {**values, **x}, kept, most=_FULL)) is not None]
+        y := fit(first.recording, {**values, **x}, kept, most=_FULL)) is not None]
     if not alike:
         return None
     values = min(alike, key=lambda x: loss(x.residual, best.scale)).values
     modes = quantities.modes_of(values)
-    found = fit(one.recording, values, (*wide, *(x[1] for x in modes)), most=_FULL)
+    found = fit(first.recording, values, (*wide, *(x[1] for x in modes)), most=_FULL)
     if found is None:
         return None
     # A recording shows where a mode is only if it is strong and rings.
     strong = [x[0] for x in modes
               if found.values[x[1]] > _STRONG and found.values[x[2]] < BROAD]
-    found = fit(one.recording, found.values, (*found.free, *strong), most=_FULL) or found
+    found = fit(first.recording, found.values, (*found.free, *strong), most=_FULL) or found
     found = _completed(_viscous(found), free)
     return found if possible(found) and (
         unexplained(found) < _ALIKE * unexplained(best)) else None
 
 
-def _named(modes: Sequence[Sequence[float]]) -> dict[str, float]:
-    """Return the values of modes by name, from numbers as `Modes.numbers`."""
-    return {x: y for names, numbers in zip(SECONDARY, modes, strict=False)
-            for x, y in zip(names, numbers, strict=True)}
-
-
 def narrower(
-        one: Fit, start: Mapping[str, Any], free: Sequence[str], limit: float,
-        given: Sequence[Sequence[float]]) -> Fit:
+        first: Fit, free: Sequence[str], limit: float, given: Sequence[Sequence[float]]) -> Fit:
     """
     Return a fit with modes, in which none stands for several if the recording allows it.
 
@@ -460,7 +452,7 @@ def narrower(
     Where modes leave more than noise, those with the damping of a viscous material are better,
     unless they leave clearly more. Arguments are those of `with_modes`.
     """
-    narrow = with_modes(one, start, free, limit, given, viscous=True)
+    narrow = with_modes(first, free, limit, given, viscous=True)
     modes, freed = quantities.modes_of(narrow.values), None
     if modes and whiteness(narrow.root * narrow.residual).white:
         return narrow
@@ -470,7 +462,7 @@ def narrower(
             most=_FULL)
         if freed is not None and _gain(narrow, freed)[1] < ENOUGH:
             return narrow
-    best = with_modes(one, start, free, limit, given)
+    best = with_modes(first, free, limit, given)
     found = whiteness(best.root * best.residual)
     if not modes or found.white or distant(best, found):
         return best

@@ -293,11 +293,11 @@ def values_of(
     return {name: x.default for name, x in QUANTITIES.items()} | actuator.numbers | {
         'time_unit': actuator.time_unit, 'law': actuator.law, 'initial_stretch': actuator.rest,
         'bulk_ratio': actuator.bulk_ratio, _EXPONENT: actuator.transverse_mass_exponent,
-        **actuator.factors, **_modes_of(actuator.modes),
+        **actuator.factors, **values_of_modes(actuator.modes),
         **others}
 
 
-def _modes_of(modes: Modes) -> dict[str, float]:
+def values_of_modes(modes: Modes) -> dict[str, float]:
     """Return the values of secondary modes."""
     return {name: value for names, row in zip(SECONDARY, modes.numbers, strict=False)
             for name, value in zip(names, row, strict=True)}
