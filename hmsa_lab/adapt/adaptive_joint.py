@@ -438,9 +438,7 @@ class AdaptiveJoint:
 
     def _unlikely(self, values: Mapping[str, Any]) -> float:
         """Return the negative log probability of values before any sample, up to a constant."""
-        prior = self.prior
-        off = (coordinates(values, prior.free) - coordinates(
-            prior.values, prior.free)) / prior.spread
+        off = self.prior.departures(coordinates(values, self.prior.free))
         return 0.5 * float(off @ off)
 
     @property

@@ -455,7 +455,7 @@ class Estimator:
     def _strange(self, z: Array) -> str:
         """Return a message on implausible parameters that samples would need; else empty."""
         prior = self.prior
-        off = np.abs(z[:-2] - coordinates(prior.values, prior.free)) / prior.spread
+        off = np.abs(prior.departures(z[:-2]))
         names = [x for x, share in zip(prior.free, off.tolist(), strict=True)
                  if share >= _STRANGE * _BOUND and x not in _FREELY]
         return f'samples fit only with an implausible {" and ".join(names)}' if names else ''

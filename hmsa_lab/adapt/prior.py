@@ -194,6 +194,10 @@ class Prior:
         """Kind of position that samples measure."""
         return coordinate_of(self.values['law'])
 
+    def departures(self, z: Array) -> Array:
+        """Return how far coordinates are from the values, relative to the spread, shape (p,)."""
+        return np.asarray((z - coordinates(self.values, self.free)) / self.spread)
+
     def at_temperature(self, temperature: float) -> 'Prior':
         """Return the prior of the same block at a temperature in degrees Celsius."""
         return replace(self, values={**self.values, TEMPERATURE: temperature})
