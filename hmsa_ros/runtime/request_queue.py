@@ -250,9 +250,10 @@ class RequestQueue:
                 'has acknowledged it')
         if severity is Severity.OK and not plans:
             code, words = Code.UNCHANGED, 'already on the way there: the plan is unchanged'
-        until = min((x.begin for x in drafts.values()), default=0) - self._around.clock()
-        if isinstance(request, Trajectory) and request.stamp is None and until > _SOON:
-            words = f'{words}; begins {until / NANOSECONDS:.2g} s later, since planning takes time'
+        if isinstance(request, Trajectory) and request.stamp is None and drafts:
+            until = min(x.begin for x in drafts.values()) - self._around.clock()
+            if until > _SOON:
+                words += f'; begins {until / NANOSECONDS:.2g} s later, since planning takes time'
         if self.temperatures.joints and (why := self.temperatures.words()):
             words = f'{words}; {why}'
         self._reporting.give(
