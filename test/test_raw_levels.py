@@ -15,6 +15,7 @@ from hmsa.identification.measurement import read_levels
 from hmsa.model.status import Code, RefusedError
 from hmsa.planning.history import Deviation
 from hmsa.planning.planner import Options, Planner
+from hmsa.planning.timeline import PlannedLevel
 
 SECOND = 1_000_000_000
 RUN_SECONDS = 300.0
@@ -81,6 +82,29 @@ def test_reports_of_levels_as_planned_leave_the_plan_as_it_is():
         assert planner.plan is plan
         assert planner.unknown(level.stamp)[0] is level
     assert not planner.awaiting
+
+
+def test_reports_of_many_late_levels_cost_little_and_leave_the_prediction_right(monkeypatch):
+    late, planner = SECOND // 10, Planner(BLOCK, Options(lead_time=SECOND // 20))
+    points = [(level_of(1.1 + 0.01 * (i % 3)), i * SECOND // 1000) for i in range(300)]
+    planner.take(planner.draft_levels(points, None, SECOND), SECOND)
+    sent = planner.due(2 * SECOND)
+    predictions = []
+    after = PlannedLevel.after
+    monkeypatch.setattr(
+        PlannedLevel, 'after', lambda self, level: predictions.append(self) or after(self, level))
+    for level in sent[:100]:
+        planner.applied(level.stamp + late, level.flux_density, 0)
+    assert len(predictions) <= 250
+    # The others have not been reported yet: they take effect in time, but in order.
+    time = sent[-1].stamp + SECOND // 50
+    stamps = [x.stamp + late for x in sent[:100]]
+    stamps += [max(x.stamp, stamps[-1]) for x in sent[100:]]
+    times = np.array([time, *stamps]) / SECOND - 1.0
+    levels = np.array([x.flux_density for x in sent])
+    expected = simulate(
+        np.array([0.0, times[0]]), np.append(0.0, times[1:]), np.append(0.0, levels))[-1]
+    assert planner.state(time).stretch == pytest.approx(expected, abs=1e-6)
 
 
 @pytest.mark.parametrize(('levels', 'options', 'code', 'words'), [

@@ -211,7 +211,8 @@ class PlannerGroup:
         start = max((x[0] for x in ahead if x and x[0] <= begin), default=0)
         stamps = sorted({x for each in ahead for x in each if x >= start})[:limit]
         return stamps, {
-            name: _samples(planner.plan, stamps) for name, planner in self.planners.items()}
+            name: _samples(planner.caught_up(), stamps)
+            for name, planner in self.planners.items()}
 
 
 def _of_joint(name: str, error: RefusedError) -> RefusedError:

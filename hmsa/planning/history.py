@@ -79,7 +79,8 @@ class History:
         """Return the history without levels ``start`` to ``end``, which never took effect."""
         sent = self.sent - max(min(self.sent, end) - start, 0)
         return self._with(
-            self.levels[:start] + self.levels[end:], sent=sent, stale=start).predicted(sent)
+            self.levels[:start] + self.levels[end:], sent=sent,
+            stale=start if self.stale is None else min(self.stale, start))
 
     def with_news(
             self, stamp: int, flux_density: float,
@@ -113,7 +114,7 @@ class History:
         deviation = replace(deviation, change=flux_density - levels[known].flux_density)
         if rest == known + 2 and news == levels[known + 1]:
             # As planned: the work does not grow with the plan.
-            return replace(self, known=known + 1).predicted(self.sent), deviation
+            return replace(self, known=known + 1).predicted(known + 3), deviation
         after = levels[rest:self.sent]
         if after and after[0].stamp < stamp:
             after = tuple(
@@ -128,27 +129,32 @@ class History:
                 else x for x in changed[known + 2:]))
         elif deviation == Deviation() and _same(flux_density, taken.flux_density):
             stale = None if self.stale is None else self.stale + count - self.sent
+        # Up to the next level, which may agree. Others are predicted when that is read, since
+        # there may be hundreds, and as many reports.
         return self._with(
-            changed, sent=count, known=known + 1, stale=stale).predicted(count), deviation
+            changed, sent=count, known=known + 1, stale=stale).predicted(known + 3), deviation
 
     def predicted(self, end: int) -> 'History':
         """
         Predict stale levels again up to an index, or until a prediction agrees with the plan.
 
-        After a deviation, only levels that have been sent are predicted again, so that the work
-        does not grow with the plan. This method catches up as far as needed.
+        The rest of the plan is then valid, unless levels that follow were moved.
         """
+        end = min(end, len(self.levels))
         if self.stale is None or self.stale >= end:
             return self
+        moved = next((
+            i for i in reversed(range(self.known + 1, self.sent))
+            if self.levels[i].sent_for is not None), self.known)
         anew: list[PlannedLevel] = []
+        settled = end == len(self.levels)
         for place in range(self.stale, end):
             before = anew[-1] if anew else self.levels[place - 1]
             anew.append(self.levels[place].after(before))
-            if place >= self.sent and agree(anew[-1], self.levels[place]):
+            if place > moved and agree(anew[-1], self.levels[place]):
+                settled = True
                 break
         stop = self.stale + len(anew)
-        settled = stop < end or stop == len(self.levels) or (
-            stop > self.sent and agree(anew[-1], self.levels[stop - 1]))
         return self._with(
             self.levels[:self.stale] + tuple(anew) + self.levels[stop:],
             stale=None if settled else stop)
@@ -162,14 +168,16 @@ class History:
             if abs(levels[i].stamp - stamp) <= tolerance and self.near(
                     levels[i].flux_density, flux_density):
                 return i
-        same = [i for i in sent if self.near(levels[i].flux_density, flux_density)]
-        for i in same:
-            if levels[i].stamp < stamp and levels[i].flux_density != levels[i - 1].flux_density:
+        for i in sent:
+            if (levels[i].stamp < stamp and levels[i].flux_density != levels[i - 1].flux_density
+                    and self.near(levels[i].flux_density, flux_density)):
                 return i
         if _same(flux_density, levels[self.known].flux_density):
             return None  # already in effect, and not the early start of a slow path
         # A driver that rounds to its own steps may be early, but not by skipping a change.
-        return next((i for i in same if not self._changes(range(self.known + 1, i))), None)
+        return next((
+            i for i in sent if self.near(levels[i].flux_density, flux_density)
+            and not self._changes(range(self.known + 1, i))), None)
 
     def _short(
             self, sent: range, stamp: int, flux_density: float, tolerance: int) -> int | None:

@@ -327,7 +327,8 @@ class Planner(RunningPlan):
             state = ahead.held(
                 ahead.taken_from(state, model), model, self.plan.level(begin).flux_density)
             model = ahead
-        return PlanStart(self.plan, model, begin, state, self._history.stale, self.check, warmth)
+        plan = self.caught_up()
+        return PlanStart(plan, model, begin, state, self._history.stale, self.check, warmth)
 
     def as_held(self, time: int) -> Believed | None:
         """

@@ -70,6 +70,11 @@ class RunningPlan:
         """Levels that took effect recently, and the plan from the present level on."""
         return self._history.plan
 
+    def caught_up(self) -> Timeline:
+        """Return the plan, with the levels that were sent predicted from what took effect."""
+        self._history = self._history.predicted(self._history.sent)
+        return self.plan
+
     def restart(self) -> None:
         """Drop all plans and return to the initial state at rest, as the clock has restarted."""
         model, stretch = self.model, self._initial
@@ -144,7 +149,7 @@ class RunningPlan:
         """Replace the plan from the start of a draft of this revision on; return the plan."""
         if draft is None:
             return self.plan
-        history, old, begin = self._history, self.plan, draft.begin
+        old, history, begin = self.caught_up(), self._history, draft.begin
         kept = bisect_left(old.levels, begin, key=STAMP)
         begun = bisect_right(old.levels, now, key=STAMP)
         # Forget levels that were sent and are over, except the present one and those for which
@@ -173,10 +178,8 @@ class RunningPlan:
         if first == len(levels) or levels[first].stamp > latest:
             return ()
         end = bisect_right(levels, latest, first, key=STAMP)
-        if history.stale is not None:
-            history = history.predicted(end)
         self._history = replace(history, sent=end)
-        return history.plan.levels[first:end]
+        return levels[first:end]
 
     def moves(self, now: int) -> bool:
         """Return whether setpoints are still to be reached at a time in ns."""
@@ -196,7 +199,7 @@ class RunningPlan:
     @property
     def last_sent(self) -> PlannedLevel:
         """Level that was sent last, or the initial one."""
-        return self.plan.levels[self._history.sent - 1]
+        return self.caught_up().levels[self._history.sent - 1]
 
     def beat_stamp(self, now: int) -> int:
         """Return the timestamp in ns for a heartbeat that repeats the last level."""
