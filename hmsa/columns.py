@@ -1,4 +1,4 @@
-"""Columns of numbers from CSV files, with precise error messages."""
+"""Columns of numbers in files: read from CSV with precise error messages, and written."""
 
 from collections.abc import Mapping
 import csv
@@ -7,14 +7,20 @@ import io
 import math
 from pathlib import Path
 import re
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hmsa.errors import assume, BadInputError, excerpt
-from hmsa.files import read_at_most
+from hmsa.files import read_at_most, replacing, require_arrow
 
 Array = NDArray[np.float64]
+
+#: Units of the columns of samples and levels.
+UNITS = {'time': 's', 'stretch': '1', 'stretch_rate': '1/s', 'flux_density': 'T'}
+# Formats in which columns are written.
+_FORMATS = ('.csv', '.parquet', '.mat')
 
 _SEPARATORS = (';', '\t', ',', '|')
 _STRONGEST = 5.0  # maximum flux density of a coil in T
@@ -373,3 +379,42 @@ def _taken(
                 + ['converted to SI units'] * (factors[name] != 1.0))
             found.append((text, not place.alias))
     return found
+
+
+def read_only(values: NDArray[Any]) -> NDArray[Any]:
+    """Return a view of an array that cannot be written to."""
+    view = values.view()
+    view.flags.writeable = False
+    return view
+
+
+def write_table(path: Path, columns: Mapping[str, Array]) -> None:
+    """
+    Write columns as CSV, Parquet or Matlab file, by the suffix of the name, in full precision.
+
+    NaN is left empty in CSV. Raise `BadInputError` if the suffix is unknown, pyarrow is missing,
+    or the file cannot be written.
+    """
+    kind = path.suffix.lower()
+    if kind not in _FORMATS:
+        raise BadInputError(
+            f'the format of {path} is unknown: expected a name that ends in '
+            + ' or '.join(_FORMATS))
+    if kind == '.parquet':
+        arrow, parquet = require_arrow()
+        with replacing(path) as beside:
+            parquet.write_table(arrow.table(dict(columns)), beside)
+        return
+    if kind == '.mat':
+        from scipy.io import savemat  # slow to import
+
+        # Open the file here, since errors of savemat do not give the reason.
+        with replacing(path) as beside, beside.open('wb') as matrix:
+            savemat(matrix, dict(columns), oned_as='column')
+        return
+    with replacing(path) as beside, beside.open('w', newline='', encoding='utf-8') as file:
+        writer = csv.writer(file)
+        writer.writerow(columns)
+        writer.writerows(
+            ['' if math.isnan(value) else repr(value) for value in row]
+            for row in zip(*(x.tolist() for x in columns.values()), strict=True))

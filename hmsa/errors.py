@@ -6,7 +6,6 @@ obvious, the remedy.
 """
 
 from collections.abc import Iterable
-from difflib import get_close_matches
 import math
 import reprlib
 import sys
@@ -76,12 +75,19 @@ def nearest(name: str, known: Iterable[str]) -> str:
     """Return the known names that end in another one, or else the closest, however far it is."""
     names = sorted(set(known))
     same = [x for x in names if x.rpartition('.')[2] == name]
-    return listed(same or get_close_matches(name[:_LONGEST_NAME], names, 1, 0.0))
+    return listed(same or _close(name[:_LONGEST_NAME], names, 0.0))
+
+
+def _close(word: str, names: list[str], least: float = 0.6) -> list[str]:
+    """Return the name closest to a word, or nothing if none is as similar as ``least``."""
+    from difflib import get_close_matches  # slow to import
+
+    return get_close_matches(word, names, 1, least)
 
 
 def meant(word: object, known: Iterable[str]) -> str:
     """Return ``; did you mean NAME?`` with the known name closest to a word, or nothing."""
-    near = get_close_matches(str(word), list(known), 1)
+    near = _close(str(word), list(known))
     return f'; did you mean {near[0]}?' if near else ''
 
 

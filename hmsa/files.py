@@ -9,7 +9,6 @@ import os
 from pathlib import Path
 import stat
 from typing import Any
-import uuid
 
 from hmsa.errors import BadInputError
 
@@ -45,6 +44,8 @@ def _beside(path: Path) -> Iterator[tuple[Path, Path]]:
         if target.exists() and not stat.S_ISREG(target.stat().st_mode):
             yield target, target
             return
+        import uuid  # slow to import
+
         # Processes on two hosts may have the same number.
         beside = target.with_name(f'.{target.name}.{uuid.uuid4().hex}.part')
         try:

@@ -2,9 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from html import escape
 import math
-import shutil
 import sys
 import textwrap
 from typing import Any, overload, SupportsIndex
@@ -129,7 +127,7 @@ class Table:
             lines += [''] * bool(lines) + _aligned(
                 [heads[i] for i in block], [[row[i] for i in block] for row in texts],
                 [right[i] for i in block])
-        room = max(shutil.get_terminal_size().columns, 60)
+        room = max(_width_of_terminal(80), 60)
         wide = max((len(x) for x, _ in self.legend), default=0) + len(_GAP)
         for text, indent in (
                 (self.caption, 0), *((f'{x:<{wide}}{y}', wide) for x, y in self.legend),
@@ -146,6 +144,8 @@ class Table:
         return max(1, named.index(False) if False in named else 1)
 
     def _repr_html_(self) -> str:
+        from html import escape  # slow to import
+
         # Words to the left, numbers to the right, as notebooks show a DataFrame.
         styles = ['' if x else ' style="text-align: left"' for x in self._right()]
 
@@ -216,8 +216,14 @@ def _room() -> float:
     A terminal and a notebook break longer lines anywhere.
     """
     if sys.stdout.isatty() or 'ipykernel' in sys.modules:
-        return shutil.get_terminal_size((_NOTEBOOK, 24)).columns
+        return _width_of_terminal(_NOTEBOOK)
     return math.inf
+
+
+def _width_of_terminal(otherwise: int) -> int:
+    from shutil import get_terminal_size  # slow to import
+
+    return get_terminal_size((otherwise, 24)).columns
 
 
 def _stacked(title: str, width: int) -> list[str]:

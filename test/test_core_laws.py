@@ -11,6 +11,7 @@ import pytest
 
 from hmsa import motion
 from hmsa.cli import main
+from hmsa.columns import write_table
 from hmsa.errors import AssumedWarning, BadInputError
 from hmsa.identification.files import read_belief
 from hmsa.identification.identify import identify
@@ -36,7 +37,6 @@ from hmsa.planning.shapers import get_shaper
 from hmsa.planning.shapers.request import MoveRequest
 from hmsa.planning.two_step import Groups, plan_two_step, plan_two_step_batch
 from hmsa.runs.parameters import read_parameter_file, recorded
-from hmsa.runs.record import write_table
 
 mpmath = needs('mpmath')
 

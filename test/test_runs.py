@@ -12,6 +12,7 @@ import pytest
 
 from hmsa.bag.info import BagSummary
 from hmsa.cli import main
+from hmsa.columns import write_table
 from hmsa.errors import BadInputError
 from hmsa.files import json_text, replacing, write_text
 from hmsa.interfaces.actuator import parameters_of
@@ -22,7 +23,7 @@ from hmsa.model.simulation import ActuatorSimulation
 from hmsa.model.units import NANOSECONDS
 from hmsa.runs import bags
 from hmsa.runs.parameters import actuators, read_parameter_file, recorded, values_of
-from hmsa.runs.record import lateness_of, levels_of, RecordedLevel, Run, samples_of, write_table
+from hmsa.runs.record import lateness_of, levels_of, RecordedLevel, Run, samples_of
 from hmsa.runs.topics import APPLIED, COMMAND
 from hmsa.runs.verify import verify_run
 

@@ -25,7 +25,6 @@ from hmsa.interfaces.parameters import (
     VISCOELASTIC,
 )
 from hmsa.interfaces.topics import PLANNER
-from hmsa.model.continuum import check_mount, clamped, mounted
 from hmsa.model.delivery import IDEAL
 from hmsa.model.equations import Array, critical_zeta
 from hmsa.model.laws import LAWS
@@ -396,7 +395,7 @@ def model_of(
         values = {**values, 'actuator.damping_coefficient': unit * number(
             zeta, 'zeta', least=0.0)}
     model = model_from(checked(values))
-    check_mount(mount)
+    check_choice('mount', mount, MOUNTS)
     return model if mount == _PAPER else JointModel(
         _mounted(model.actuator, mount, ratio), model.options)
 
@@ -421,6 +420,8 @@ def _mounted(actuator: ActuatorParameters, mount: str, ratio: float | None) -> A
 
 def _held(block: ActuatorParameters, mount: str, ratio: float | None) -> ActuatorParameters:
     """Return a block with its modes."""
+    from hmsa.model.continuum import mounted  # slow to import
+
     shape = block.half_thickness / block.half_length
     given = math.inf if block.law is not None else block.chain_limit
 
@@ -437,6 +438,8 @@ def _held(block: ActuatorParameters, mount: str, ratio: float | None) -> Actuato
 
 def clamped_beam(beam: ActuatorParameters, ratio: float | None = None) -> ActuatorParameters:
     """Return a beam along its elastica, with its second mode."""
+    from hmsa.model.continuum import clamped  # slow to import
+
     made = along_elastica(beam)
     ratio, coefficient = _damped(made, ratio)
     return replace(made, damping_coefficient=coefficient, modes=clamped(ratio))

@@ -13,7 +13,6 @@ from hmsa.api.arguments import CLAMPED, clamped_beam
 from hmsa.errors import assume, BadInputError, UnusualWarning
 from hmsa.interfaces.actuator import actuator_from, parameters_of
 from hmsa.interfaces.quantities import FORMS
-from hmsa.model.continuum import SHAPES, spectrum
 from hmsa.model.equations import (
     critical_zeta,
     elastic_force,
@@ -271,6 +270,8 @@ def _facts_of_volume(block: ActuatorParameters) -> list[tuple[str, str]]:
 
 def _first(block: ActuatorParameters) -> list[tuple[str, str]]:
     """Return the first frequency of a free block, which does not deform uniformly."""
+    from hmsa.model.continuum import SHAPES, spectrum  # slow to import
+
     shape = block.half_thickness / block.half_length
     if block.modes.ratios or not SHAPES[0] <= shape <= SHAPES[1]:
         return []

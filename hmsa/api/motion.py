@@ -9,6 +9,7 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 
 from hmsa.api.arguments import file_of, number, several, suggesting, whole
+from hmsa.columns import read_only, UNITS
 from hmsa.errors import BadInputError, check_choice, excerpt, meant
 from hmsa.interfaces.diagnostics import Outcome
 from hmsa.model.equations import Array
@@ -17,11 +18,9 @@ from hmsa.model.units import NANOSECONDS
 from hmsa.runs.record import (
     described,
     levels_of,
-    read_only,
     RecordedLevel,
     Run,
     samples_of,
-    UNITS,
     write_run,
 )
 from hmsa.table import dataset, frame, Table

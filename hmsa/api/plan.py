@@ -6,20 +6,22 @@ from functools import cached_property
 from inspect import signature
 import math
 from pathlib import Path
-from typing import Any, NamedTuple, overload, SupportsIndex
+from typing import Any, NamedTuple, overload, SupportsIndex, TYPE_CHECKING
 
 import numpy as np
 
 from hmsa.api.actuator import Actuator
 from hmsa.api.arguments import check_names, file_of, number, numbers, several, suggesting
-from hmsa.api.motion import Motion, simulated
+from hmsa.columns import read_only, UNITS, write_table
 from hmsa.errors import BadInputError, excerpt
 from hmsa.model.equations import Array
 from hmsa.model.simulation import response
 from hmsa.model.status import Code, RefusedError
 from hmsa.planning.sequence import Segment
-from hmsa.runs.record import read_only, UNITS, write_table
 from hmsa.table import Column, dataset, frame, Table
+
+if TYPE_CHECKING:
+    from hmsa.api.motion import Motion
 
 _MOST_BETWEEN = 4
 
@@ -202,7 +204,7 @@ class Plan:
     def simulate(
             self, *, truth: Actuator | None = None, noise: float = 0.0,
             rate: float | None = None, until: float | None = None, seed: int = 0,
-            label: str = 'simulated') -> Motion:
+            label: str = 'simulated') -> 'Motion':
         """
         Simulate the plan, on the planned actuator or on another one.
 
@@ -244,6 +246,8 @@ class Plan:
             raise BadInputError(
                 f'truth is {excerpt(truth)}: expected an Actuator, such as '
                 'block.scaled(shear_modulus=1.1)')
+        from hmsa.api.motion import simulated  # slow to import
+
         return simulated(
             truth or self.actuator, self.times, self.flux_densities,
             self.segments[0].start.stretch, self, until=until, rate=rate, noise=noise, seed=seed,

@@ -90,7 +90,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _write_path(arguments: argparse.Namespace, actuator: 'Actuator', shape: Any) -> None:
     """Write the points of the wave; raise `BadInputError` for a square wave."""
     from hmsa.api.paths import wave_of, wave_path, wave_points
-    from hmsa.runs.record import write_table
+    from hmsa.columns import write_table
 
     if shape == 'square':
         raise BadInputError(

@@ -21,7 +21,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
 import math
-from typing import Any
 
 import numpy as np
 from numpy.polynomial import legendre
@@ -308,11 +307,6 @@ def _together(frequencies: Array, shares: Array) -> tuple[Array, Array]:
     return tuple(np.array(found).T)
 
 
-def check_mount(mount: Any) -> None:
-    """Raise `BadInputError` if a value is not in `MOUNTS`."""
-    check_choice('mount', mount, MOUNTS)
-
-
 @lru_cache(maxsize=64)
 def mounted(
         shape: float, mount: str, j_lim: float, damping_ratio: float,
@@ -344,7 +338,7 @@ def mounted(
         If an argument is out of range.
 
     """
-    check_mount(mount)
+    check_choice('mount', mount, MOUNTS)
     check_number(
         f'with mount {mount} half_thickness/half_length', shape, least=SHAPES[0], most=SHAPES[1])
     found = spectrum(shape, mount, bulk_ratio=bulk_ratio)

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 import math
 from operator import attrgetter
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
@@ -24,10 +24,12 @@ from hmsa.model.parameters import ActuatorParameters, NondimensionalParameters, 
 from hmsa.model.simulation import follow, longest_motion, observed, sampled
 from hmsa.model.status import Code
 from hmsa.model.units import NANOSECONDS, Units
-from hmsa.planning.path import Path
 from hmsa.planning.sequence import Remaining, SHORT_SPELL
 from hmsa.planning.shapers import creeping, get_shaper
 from hmsa.planning.shapers.request import as_errors, ERRORS, PACE, SmoothLimits
+
+if TYPE_CHECKING:
+    from hmsa.planning.path import Path  # slow to import
 
 #: Options that describe coil and block, and can be estimated.
 ESTIMATED = ('coil_time_constant', 'constant_force')
@@ -293,7 +295,7 @@ class PlannedSegment:
     until: int | None = None  #: end as requested; None if it is held on
     carried_out: bool = True  #: whether its commands were sent and took effect, as far as known
     #: Path to follow, in s from ``since`` on; None for a move.
-    path: Path | None = field(default=None, compare=False, repr=False)
+    path: 'Path | None' = field(default=None, compare=False, repr=False)
     #: Vibration of an actuator with secondary modes after the move; None for none.
     left: Remaining | None = None
 

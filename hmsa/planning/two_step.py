@@ -5,7 +5,6 @@ A constant load beta_p brings the actuator to its turning point exactly at the t
 load that holds the target, beta_1, replaces it and no vibration remains.
 """
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 import math
 import os
@@ -192,6 +191,8 @@ def plan_two_step_batch(
         for part in parts:
             plan(part)
     else:
+        from concurrent.futures import ThreadPoolExecutor  # slow to import
+
         with ThreadPoolExecutor(count) as pool:
             list(pool.map(plan, parts))
     return TwoStepBatch(status.reshape(shape), *(a.reshape(shape) for a in results))

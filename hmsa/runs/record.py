@@ -7,18 +7,17 @@ Its levels of the field are commanded, superseded, repeated, and applied.
 from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-import csv
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 import math
 from pathlib import Path
-from typing import Any, cast, TYPE_CHECKING
+from typing import cast, TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hmsa.columns import read_only, write_table
 from hmsa.errors import BadInputError
-from hmsa.files import replacing, require_arrow
 from hmsa.interfaces.diagnostics import LEVELS, Outcome
 from hmsa.interfaces.parameters import LATENESS_LIMIT, number_of
 from hmsa.interfaces.topics import PLANT
@@ -174,13 +173,6 @@ class _ByLevel:
                     found = stamp
                     break
         return None if found == until else int(found)
-
-
-def read_only(values: NDArray[Any]) -> NDArray[Any]:
-    """Return a view of an array that cannot be written to."""
-    view = values.view()
-    view.flags.writeable = False
-    return view
 
 
 @dataclass(frozen=True)
@@ -402,13 +394,6 @@ def _ramp(run: Run, before: RecordedLevel, level: RecordedLevel) -> int:
         min(abs(level.flux_density - before.flux_density) / slew, 1e6) * NANOSECONDS)
 
 
-SUFFIXES = ('.csv', '.parquet', '.mat')
-
-
-#: Units of the columns of samples and levels.
-UNITS = {'time': 's', 'stretch': '1', 'stretch_rate': '1/s', 'flux_density': 'T'}
-
-
 def samples_of(run: Run) -> dict[str, Array]:
     """
     Return the samples of a run by column name.
@@ -460,35 +445,3 @@ def write_run(path: Path, run: Run) -> list[Path]:
 def levels_beside(path: Path) -> Path:
     """Return the path of the table of levels that belongs to a file of samples."""
     return path.with_name(f'{path.stem}_levels{path.suffix}')
-
-
-def write_table(path: Path, columns: Mapping[str, Array]) -> None:
-    """
-    Write columns as CSV, Parquet or Matlab file, by the suffix of the name, in full precision.
-
-    NaN is left empty in CSV. Raise `BadInputError` if the suffix is unknown, pyarrow is missing,
-    or the file cannot be written.
-    """
-    kind = path.suffix.lower()
-    if kind not in SUFFIXES:
-        raise BadInputError(
-            f'the format of {path} is unknown: expected a name that ends in '
-            + ' or '.join(SUFFIXES))
-    if kind == '.parquet':
-        arrow, parquet = require_arrow()
-        with replacing(path) as beside:
-            parquet.write_table(arrow.table(dict(columns)), beside)
-        return
-    if kind == '.mat':
-        from scipy.io import savemat  # slow to import
-
-        # Open the file here, since errors of savemat do not give the reason.
-        with replacing(path) as beside, beside.open('wb') as matrix:
-            savemat(matrix, dict(columns), oned_as='column')
-        return
-    with replacing(path) as beside, beside.open('w', newline='', encoding='utf-8') as file:
-        writer = csv.writer(file)
-        writer.writerow(columns)
-        writer.writerows(
-            ['' if math.isnan(value) else repr(value) for value in row]
-            for row in zip(*(x.tolist() for x in columns.values()), strict=True))

@@ -258,7 +258,7 @@ def _files(out: Path | None) -> tuple[Path, ...]:
 
 def _write_table(out: Path, columns: 'dict[str, Array]') -> Path:
     """Write columns to a table next to a parameter file; return its path."""
-    from hmsa.runs.record import write_table
+    from hmsa.columns import write_table
 
     _, table = _files(out)
     write_table(table, columns)
