@@ -72,7 +72,8 @@ class RunningPlan:
 
     def caught_up(self) -> Timeline:
         """Return the plan, with the levels that were sent predicted from what took effect."""
-        self._history = self._history.predicted(self._history.sent)
+        if self._history.stale is not None:
+            self._history = self._history.predicted(self._history.sent)
         return self.plan
 
     def restart(self) -> None:
