@@ -1,5 +1,6 @@
 """The client of a planner: whom it waits for, verdicts of its own, the stop."""
 
+from dataclasses import replace
 import math
 import re
 import signal
@@ -11,6 +12,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from hmsa.cli import main, terminal
 from hmsa.errors import HmsaError
+from hmsa.model.units import NANOSECONDS
 from hmsa_ros.clients.client import PlannerClient
 from hmsa_ros.clients.link import Link
 from hmsa_ros.nodes.planner import PlannerNode
@@ -116,6 +118,21 @@ def test_a_client_that_waits_in_vain_says_what_it_knows_and_how_to_stop_the_requ
             client.follow(verdict, timeout=0.1)
         assert 'did not report the end of the sequence' in str(caught.value)
         assert f'{known} status: setpoint 1 of 1, ' in str(caught.value)
+
+
+@pytest.mark.ros
+def test_the_limit_of_a_wait_counts_from_the_start_of_the_sequence(
+        ros_env, serve, monkeypatch):
+    runtime = serve(PlannerNode).nodes[0]._runtime
+    request = runtime.request
+    monkeypatch.setattr(runtime, 'request', lambda asked: request(replace(
+        asked, stamp=runtime.environment.clock() + 2 * NANOSECONDS)))
+    with PlannerClient() as client:
+        client.find_planner()
+        verdict = client.send_sequence([(1.1, 60.0)])
+        assert client.verdict.state == 'waiting'
+        with pytest.raises(HmsaError, match='status: setpoint 1 of 1, '):
+            client.follow(verdict, timeout=0.1)
 
 
 @pytest.mark.ros

@@ -343,7 +343,8 @@ class PlannerClient(Link):
         each : callable, optional
             Called about 20 times a second with the newest verdict.
         timeout : float
-            Time limit in s, of simulated time if that is published and slower.
+            Time limit in s from the start of the sequence on, of simulated time if that is
+            published and slower.
 
         Returns
         -------
@@ -379,8 +380,8 @@ class PlannerClient(Link):
         with _slower_time(self.node, self.timeout) as time:
             self.spin_until(
                 done, lambda: self._may_run('the planner did not report the end of the sequence'),
-                None if each is None else lambda: each(self.verdict), timeout, time,
-                'the end of the sequence')
+                None if each is None else lambda: each(self.verdict), timeout,
+                self._since_start(time), 'the end of the sequence')
         end = self.verdict
         if end.state != 'idle':
             # A refused request leaves the sequence alone, and is the last one in the status.
@@ -395,6 +396,20 @@ class PlannerClient(Link):
                 f'{late} commands came late, and the result is not measured: expected '
                 'commands in time (lead_time), or samples (joint_states)')
         return end
+
+    def _since_start(self, time: Callable[[], float]) -> Callable[[], float]:
+        """Return a clock in s that stands still until the planner begins the sequence."""
+        waited, before = 0.0, time()
+
+        def passed() -> float:
+            nonlocal waited, before
+            now = time()
+            if self.verdict.state == 'waiting' and self._is_there(topics.PLANNER):
+                waited += now - before
+            before = now
+            return now - waited
+
+        return passed
 
 
 def newest_time(clock: RawSubscription) -> float | None:
