@@ -467,9 +467,10 @@ def _warnings(
             f'{stamp_error(best, known.deviation):.2g} s rms would cause: samples in '
             'motion count less')
     if not known.whiteness.white:
-        found.append(
-            'the residuals are not white: correlation widened the intervals by up to '
-            f'{float(np.max(known.correlated)):.3g} times')
+        widened = f'{float(np.max(known.correlated)):.3g}'
+        found.append('the residuals are not white' + (
+            f': correlation widened the intervals by up to {widened} times'
+            if widened != '1' else ''))
     if recording.quantum:
         found.append(f'the {recording.coordinate.name} comes in steps of {recording.quantum:.3g}')
     std = np.sqrt(np.diag(known.covariance))
