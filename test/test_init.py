@@ -124,6 +124,14 @@ def test_the_file_has_what_was_given_in_si_units(run, tmp_path):
         assert f'#   {line.strip()}' in (tmp_path / 'my own.yaml').read_text()
 
 
+def test_the_planner_of_an_actuator_with_modes_is_started_with_the_shaper_for_them(
+        run, tmp_path):
+    _, out, _ = run(*OWN, '--mount', 'free', '--out', 'free.yaml')
+    planner = 'hmsa planner --ros-args --params-file free.yaml -p shaper:=modal'
+    assert out.splitlines()[-1] == f'  {planner}'
+    assert f'#   {planner}\n' in (tmp_path / 'free.yaml').read_text()
+
+
 def test_a_block_takes_the_damping_ratio_of_its_ringing(run, tmp_path):
     own = [*OWN[:OWN.index('--zeta')], *OWN[OWN.index('--zeta') + 2:]]
     status, out, err = run(*own, '--damping-ratio', '0.04')

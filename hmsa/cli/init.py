@@ -48,7 +48,6 @@ if TYPE_CHECKING:
     from hmsa.model.parameters import ActuatorParameters
 
 _JOINT = 'actuator'
-_NODES = ('plant', 'planner')  # that read the file
 # Quantities of the coil, and those with another name in `Actuator`.
 _COIL = ('flux_max', 'flux_min', 'slew_limit')
 # Forms with their own sizes and constants.
@@ -137,7 +136,7 @@ def run(arguments: argparse.Namespace) -> int:
     table = [f'{name:<26} {value}' for name, value in facts(found, made.block)]
     write_text(path, '\n'.join([
         '# Parameters of an actuator for planner and plant, written by hmsa init:',
-        *(f'#   hmsa {x} --ros-args --params-file {quote(path.name)}' for x in _NODES),
+        *(f'#   {x}' for x in _starting(path.name, made)),
         '#', '# What follows from them (computed by hmsa init when it wrote this file):',
         *(f'#   {line}' for line in table), '/**:', '  ros__parameters:',
         *_lines(form, parameters, {x.parameter or DAMPING.parameter for x in missing},
@@ -150,7 +149,14 @@ def run(arguments: argparse.Namespace) -> int:
             'file': path, 'joints': joints, 'parameters': parameters,
             'scales': asdict(found), 'warnings': doubts},
         *table, f'\n{path} written; to use it:',
-        *(f'  hmsa {x} --ros-args --params-file {quote(str(path))}' for x in _NODES))
+        *(f'  {x}' for x in _starting(str(path), made)))
+
+
+def _starting(file: str, made: 'Actuator') -> list[str]:
+    """Return the commands that start plant and planner with a parameter file."""
+    shaper = ' -p shaper:=modal' if made.block.modes.ratios else ''
+    return [f'hmsa {x} --ros-args --params-file {quote(file)}{y}' for x, y in (
+        ('plant', ''), ('planner', shaper))]
 
 
 def _wanted(arguments: argparse.Namespace) -> tuple[str, tuple[GivenNumber, ...]]:
