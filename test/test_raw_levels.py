@@ -4,6 +4,8 @@ import csv
 import json
 import math
 
+from hypothesis import given
+from hypothesis import strategies as st
 from identification_oracle import BLOCK, level_of, simulate
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
@@ -13,6 +15,7 @@ import pytest
 from hmsa.identification.excitation import Bounds, excite
 from hmsa.identification.measurement import read_levels
 from hmsa.model.status import Code, RefusedError
+from hmsa.planning import history
 from hmsa.planning.history import Deviation
 from hmsa.planning.planner import Options, Planner
 from hmsa.planning.timeline import PlannedLevel
@@ -84,7 +87,12 @@ def test_reports_of_levels_as_planned_leave_the_plan_as_it_is():
     assert not planner.awaiting
 
 
-def test_reports_of_many_late_levels_cost_little_and_leave_the_prediction_right(monkeypatch):
+@pytest.mark.parametrize('pieces', [False, True])
+def test_reports_of_many_late_levels_cost_little_and_leave_the_prediction_right(
+        pieces, monkeypatch):
+    if pieces:
+        monkeypatch.setattr(history, '_MANY', 16)
+        monkeypatch.setattr(history, '_PIECE', 7)
     late, planner = SECOND // 10, Planner(BLOCK, Options(lead_time=SECOND // 20))
     points = [(level_of(1.1 + 0.01 * (i % 3)), i * SECOND // 1000) for i in range(300)]
     planner.take(planner.draft_levels(points, None, SECOND), SECOND)
@@ -105,6 +113,25 @@ def test_reports_of_many_late_levels_cost_little_and_leave_the_prediction_right(
     expected = simulate(
         np.array([0.0, times[0]]), np.append(0.0, times[1:]), np.append(0.0, levels))[-1]
     assert planner.state(time).stretch == pytest.approx(expected, abs=1e-6)
+
+
+@given(st.lists(st.tuples(st.integers(0, 60), st.integers(0, 5), st.integers(0, 9)), max_size=9))
+def test_a_long_plan_is_edited_as_a_short_one(edits):
+    short, pieces = tuple(range(60)), history._Pieces(history._cut(range(60)))
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(history, '_PIECE', 4)
+        for number, (place, removed, count) in enumerate(edits):
+            start, end = (min(x, len(short)) for x in (place, place + removed))
+            new = (100 * number,) * count
+            short = (*short[:start], *new, *short[end:])
+            pieces = pieces.edited(start, end, new)
+    assert (*pieces,) == short
+    assert len(pieces) == len(short)
+    assert [pieces[i] for i in range(-len(short), len(short))] == [*short, *short]
+    for start in range(len(short) + 1):
+        assert pieces[start:start + 7] == short[start:start + 7]
+        assert pieces[-start:] == short[-start:]
+        assert pieces[start:] == short[start:]
 
 
 @pytest.mark.parametrize(('levels', 'options', 'code', 'words'), [

@@ -1,9 +1,11 @@
 """Record of the levels that took effect, and its merge into the levels of a plan."""
 
-from collections.abc import Sequence
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import accumulate, chain
 import math
-from typing import Any
+from typing import Any, overload
 
 from hmsa.planning.timeline import PlannedLevel, Timeline
 
@@ -14,6 +16,9 @@ _AS_PLANNED = 3e-8
 # Levels that differ by less than this fraction of the largest one are equal for the hardware,
 # which rounds: a few steps of a 14-bit converter.
 _RESOLUTION = 2e-4
+# Levels of a plan from which on it is edited in pieces, and of a piece: to copy 60,000 levels at
+# each report of hardware that rounds takes 1.6 ms, longer than a level lasts.
+_MANY, _PIECE = 4096, 512
 
 
 @dataclass(frozen=True)
@@ -45,12 +50,15 @@ class History:
     stale: int | None = None
 
     @property
-    def levels(self) -> tuple[PlannedLevel, ...]:
+    def levels(self) -> Sequence[PlannedLevel]:
         """The levels of the plan."""
         return self.plan.levels
 
-    def _with(self, levels: tuple[PlannedLevel, ...], **known: Any) -> 'History':
-        return replace(self, plan=replace(self.plan, levels=levels), **known)
+    def _with(
+            self, start: int, end: int, levels: Sequence[PlannedLevel], **known: Any) -> 'History':
+        """Return the history with other levels in place of some."""
+        plan = replace(self.plan, levels=_edited(self.levels, start, end, levels))
+        return replace(self, plan=plan, **known)
 
     def unheard(self, now: int, lost: int) -> int:
         """
@@ -79,7 +87,7 @@ class History:
         """Return the history without levels ``start`` to ``end``, which never took effect."""
         sent = self.sent - max(min(self.sent, end) - start, 0)
         return self._with(
-            self.levels[:start] + self.levels[end:], sent=sent,
+            start, end, (), sent=sent,
             stale=start if self.stale is None else min(self.stale, start))
 
     def with_news(
@@ -119,20 +127,22 @@ class History:
         if after and after[0].stamp < stamp:
             after = tuple(
                 replace(x, stamp=stamp, sent_for=x.due) if x.stamp < stamp else x for x in after)
-        changed = (*levels[:known + 1], news, *after, *levels[self.sent:])
+        changed, until = (news, *after), self.sent
         count = known + 2 + len(after)
         stale: int | None = known + 1
         if short is not None:
             # The coil will not reach higher levels to come either.
-            changed = (*changed[:known + 2], *(
+            until = len(levels)
+            changed = (news, *(
                 replace(x, flux_density=flux_density) if _beyond(x.flux_density, flux_density)
-                else x for x in changed[known + 2:]))
+                else x for x in (*after, *levels[self.sent:])))
         elif deviation == Deviation() and _same(flux_density, taken.flux_density):
             stale = None if self.stale is None else self.stale + count - self.sent
         # Up to the next level, which may agree. Others are predicted when that is read, since
         # there may be hundreds, and as many reports.
         return self._with(
-            changed, sent=count, known=known + 1, stale=stale).predicted(known + 3), deviation
+            known + 1, until, changed, sent=count, known=known + 1,
+            stale=stale).predicted(known + 3), deviation
 
     def predicted(self, end: int) -> 'History':
         """
@@ -155,9 +165,7 @@ class History:
                 settled = True
                 break
         stop = self.stale + len(anew)
-        return self._with(
-            self.levels[:self.stale] + tuple(anew) + self.levels[stop:],
-            stale=None if settled else stop)
+        return self._with(self.stale, stop, anew, stale=None if settled else stop)
 
     def _find(
             self, sent: range, stamp: int, flux_density: float, tolerance: int) -> int | None:
@@ -207,6 +215,59 @@ class History:
         if math.isinf(largest):
             largest = max(abs(one), abs(other), abs(self.levels[self.sent - 1].flux_density))
         return abs(one - other) <= _RESOLUTION * largest
+
+
+class _Pieces(Sequence[PlannedLevel]):
+    """Levels in pieces, so that an edit does not copy all of them."""
+
+    def __init__(self, pieces: Sequence[Sequence[PlannedLevel]]) -> None:
+        self._pieces = pieces
+        self._ends = list(accumulate(map(len, pieces)))
+
+    def __len__(self) -> int:
+        return self._ends[-1]
+
+    def __iter__(self) -> Iterator[PlannedLevel]:
+        return chain.from_iterable(self._pieces)
+
+    @overload
+    def __getitem__(self, place: int) -> PlannedLevel: ...
+
+    @overload
+    def __getitem__(self, place: slice) -> Sequence[PlannedLevel]: ...
+
+    def __getitem__(self, place: int | slice) -> PlannedLevel | Sequence[PlannedLevel]:
+        if isinstance(place, slice):
+            start, end, _ = place.indices(len(self))
+            first, last = bisect_right(self._ends, start), bisect_left(self._ends, end)
+            before = self._ends[first - 1] if first else 0
+            return tuple(chain.from_iterable(
+                self._pieces[first:last + 1]))[start - before:max(end, start) - before]
+        place += len(self) if place < 0 else 0
+        number = bisect_right(self._ends, place)
+        return self._pieces[number][place - self._ends[number]]
+
+    def edited(self, start: int, end: int, levels: Sequence[PlannedLevel]) -> '_Pieces':
+        """Return the levels with others in place of some."""
+        first, last = bisect_right(self._ends, start), bisect_right(self._ends, end)
+        before = self._ends[first - 1] if first else 0
+        joined = tuple(chain.from_iterable(self._pieces[first:last + 1]))
+        joined = (*joined[:start - before], *levels, *joined[end - before:])
+        return _Pieces([*self._pieces[:first], *_cut(joined), *self._pieces[last + 1:]])
+
+
+def _cut(levels: Sequence[PlannedLevel]) -> list[Sequence[PlannedLevel]]:
+    return [levels[i:i + _PIECE] for i in range(0, len(levels), _PIECE)]
+
+
+def _edited(
+        levels: Sequence[PlannedLevel], start: int, end: int,
+        others: Sequence[PlannedLevel]) -> Sequence[PlannedLevel]:
+    """Return levels with others in place of some."""
+    if len(levels) <= _MANY:
+        return (*levels[:start], *others, *levels[end:])
+    return (levels if isinstance(levels, _Pieces) else _Pieces(_cut(levels))).edited(
+        start, end, others)
 
 
 def agree(one: PlannedLevel, other: PlannedLevel) -> bool:

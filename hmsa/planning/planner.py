@@ -130,7 +130,7 @@ class Planner(RunningPlan):
         """Return the temperature at a time in ns under the plan; None if it changes nothing."""
         return None if self.warmth is None else self.warmth.along(self._levels_until(time), time)
 
-    def _levels_until(self, time: int) -> tuple[PlannedLevel, ...]:
+    def _levels_until(self, time: int) -> Sequence[PlannedLevel]:
         """Return the levels from the known temperature on until a time in ns."""
         known = time if self.warmth is None or self.warmth.time is None else self.warmth.time
         return self.plan.levels[self.plan.place(known):self.plan.place(max(known, time)) + 1]

@@ -5,6 +5,7 @@ Times are integer nanoseconds of the caller's clock.
 """
 
 from bisect import bisect_left, bisect_right
+from collections.abc import Sequence
 from dataclasses import replace
 import math
 
@@ -165,14 +166,14 @@ class RunningPlan:
         stale = history.stale
         self._history = History(
             Timeline(
-                old.number + new, old.levels[first:kept] + draft.levels, before + draft.segments,
-                 len(before) if new else min(old.kept, len(before))),
+                old.number + new, (*old.levels[first:kept], *draft.levels),
+                before + draft.segments, len(before) if new else min(old.kept, len(before))),
             min(history.sent, kept) - first, max(min(history.known, kept - 1) - first, 0),
             stale - first if stale is not None and stale < kept else None)
         self.revision += 1
         return self.plan
 
-    def due(self, now: int) -> tuple[PlannedLevel, ...]:
+    def due(self, now: int) -> Sequence[PlannedLevel]:
         """Return the commands to send now, each once: those up to lead_time ahead."""
         history, latest = self._history, now + self.model.options.lead_time
         first, levels = history.sent, history.plan.levels
@@ -289,7 +290,7 @@ class RunningPlan:
         """Whether one of these levels is another than the one in force."""
         return self._history.awaiting_change
 
-    def unknown(self, now: int) -> tuple[PlannedLevel, tuple[PlannedLevel, ...]]:
+    def unknown(self, now: int) -> tuple[PlannedLevel, Sequence[PlannedLevel]]:
         """Return the last level known to apply by a time in ns, and the levels after it."""
         levels, place = self.plan.levels, self._history.known
         known, rest = levels[place], levels[place + 1:]

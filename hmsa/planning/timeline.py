@@ -329,7 +329,7 @@ class Timeline:
     """The plan from the present level on."""
 
     number: int  #: counts accepted requests from 1; 0 before the first
-    levels: tuple[PlannedLevel, ...]  #: by stamp; the first ones may lie in the past
+    levels: Sequence[PlannedLevel]  #: by stamp; the first ones may lie in the past
     segments: tuple[PlannedSegment, ...]  #: by time
     kept: int = 0  #: number of segments, from the first on, that belong to earlier requests
 
@@ -339,7 +339,7 @@ class Timeline:
             self, levels=tuple(x.shifted(span) for x in self.levels),
             segments=tuple(x.shifted(span) for x in self.segments))
 
-    def ahead(self, now: int, limit: int | None = None) -> tuple[PlannedLevel, ...]:
+    def ahead(self, now: int, limit: int | None = None) -> Sequence[PlannedLevel]:
         """Return the levels from the present one on, without the one that always applied."""
         first = self.place(now)
         first += self.levels[first].stamp < 0
