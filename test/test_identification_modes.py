@@ -153,7 +153,7 @@ def test_file_of_modes_is_read_by_plans_and_as_prior(found, tmp_path):
     assert belief.actuator.mass_factor == found.values['mass_factor'] != 1.0
     assert 'standard deviation' in next(
         x for x in path.read_text().splitlines() if 'modes.share:' in x)
-    # Feedback does not model secondary modes.
+    # Feedback does not estimate secondary modes.
     assert set(belief.known.names) == {
         'damping_coefficient', 'chain_limit', 'remanence', 'stretch_bias'}
 

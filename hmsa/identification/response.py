@@ -190,6 +190,7 @@ class ResponseArguments:
     wanted: NDArray[np.int64]
     # Derivatives of these by the coordinates of the free parameters; 0 for the sensor's.
     mixing: Array
+    states: int  # number of states that branches and secondary modes have behind
 
     @classmethod
     def of(
@@ -202,10 +203,12 @@ class ResponseArguments:
         last, with a column each.
         """
         given: Creep | None = values.get('creep')
+        modes = len(quantities.modes_of(values, free))
+        modal = 2 + 2 * modes if modes else 0
         branches = len(given.ratios) if given else max((
             i for i, names in enumerate(quantities.BRANCHES, 1)
             if values[names[0]] > 0.0 or set(names) & set(free)
-        ), default=len(values.get('behind', ())))
+        ), default=max(len(values.get('behind', ())) - modal, 0))
         geometry = quantities.geometry_of(values)
         theta, chain = _chain(values, geometry, branches, free)
         inner = sorted({i for x in chain.values() for i in x})
@@ -222,7 +225,9 @@ class ResponseArguments:
                     mixing[rows[i], j] = slope * x
         for j in range(1, len(more) + 1):
             mixing[-j, -j] = 1.0
-        return cls(theta, material, branches, np.array([*inner, *more], dtype=np.int64), mixing)
+        return cls(
+            theta, material, branches, np.array([*inner, *more], dtype=np.int64), mixing,
+            branches + modal)
 
 
 def respond(

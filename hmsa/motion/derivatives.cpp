@@ -52,13 +52,14 @@ bool respond(Numbers theta, Numbers material, int branches, Places wanted, Numbe
 {
     const int64_t cells = int64_t(times.count) * wanted.count;
     const int64_t modal = theta.count - first_branch - branch_places * branches;
+    const int64_t states = branches + (modal ? 2 + 2 * (modal / mode_places) : 0);
     if (!fit(branches >= 0 && branches <= most_branches && modal >= 0 && modal <= mode_places * most_modes
             && modal % mode_places == 0
             && start.count == wanted.count && begins.count && levels.count == begins.count
             && ramps.count == begins.count && stretch.count == times.count && rate.count == times.count
             && jacobian.count == cells && (!by_rate.count || by_rate.count == cells)
-            && (!behind.count || behind.count == branches)
-            && (!behind_last.count || behind_last.count == branches)))
+            && (!behind.count || behind.count == states)
+            && (!behind_last.count || behind_last.count == states)))
         return false;
     Recorded of{};
     of.theta = theta.data, of.material = material.data, of.branches = branches;

@@ -532,8 +532,7 @@ class AdaptiveJoint:
         if at is None:
             return None
         shift = float(equilibrium_stretch(model.load(level), model.material)) - at[0]
-        stretch, rate, behind = initial_state(found, creeps=bool(model.material.creep))
-        return stretch + shift, rate, behind
+        return initial_state(found, model, shift)
 
     @property
     def sensor(self) -> SensorModel:

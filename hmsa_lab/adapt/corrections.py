@@ -150,7 +150,7 @@ class Corrections:
             planner.base, estimate, planner.plan.segments[-1].stretch, _CREEPS)
         model = as_of_path(model, planner.base, estimate).at_temperature(
             planner.model.temperature)
-        state = initial_state(estimate, creeps=bool(model.actuator.creep))
+        state = initial_state(estimate, model)
 
         def adopt(draft: Draft | None) -> Draft | None:
             spent = self._clock() - begun

@@ -266,7 +266,7 @@ class Estimator:
         z = window.mean if self._solution is None else self._solution.z
         window.settle(z, _AT_REST)
         here = self._take(window, levels, until)
-        found = window.solve(z, levels, self.noise, until, here)
+        found = window.solve(z, levels, window.scatter(self.noise), until, here)
         if found is None or np.any(np.diag(found.covariance) < 0.0):
             self.screening.trouble = 'no motion leads through the samples'
             return None
@@ -408,12 +408,13 @@ class Estimator:
         both = np.append(window.time, times)
         order = np.argsort(both, kind='stable')
         window.time, window.stretch = both[order], np.append(window.stretch, stretch)[order]
-        here = None if found is None else window.simulate(found.z, levels, self.noise, until)
+        noise = window.scatter(self.noise)
+        here = None if found is None else window.simulate(found.z, levels, noise, until)
         if found is None or here is None:
             return None
         new = np.flatnonzero(order >= count)
         fits = self.screening.fitting(
-            window.stretch[new], here.residual[new], here.by[new], found.covariance, self.noise)
+            window.stretch[new], here.residual[new], here.by[new], found.covariance, noise)
         if np.all(fits):
             return here
         window.time, window.stretch = (
@@ -492,9 +493,10 @@ class Estimator:
         # Later motion shows how equilibrium depends on parameters.
         at = window.rest if self.learning is (self._fixed is None) and self._unchanged(
             self._origin, self._origin + shift, 0.0) and not self._warmed else None
+        noise = window.scatter(self.noise)
         moved = window.move_on(
-            place, time, found.z, here, self.noise, wander, warming) if at is None else (
-            window.rest_on(at, place, time, here, self.noise, wander))
+            place, time, found.z, here, noise, wander, warming) if at is None else (
+            window.rest_on(at, place, time, here, noise, wander))
         if self._warmed:
             moved.values = {**moved.values, WARMED: moved.values[WARMED] + self._warmed}
             here = here._replace(values={**here.values, WARMED: moved.values[WARMED]})

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import replace
 from datetime import datetime
+import itertools
 import math
 from pathlib import Path
 
@@ -73,10 +74,15 @@ def as_of_path(model: JointModel, before: JointModel, estimate: StateEstimate) -
     return replace(model, options=replace(model.options, constant_force=force))
 
 
-def initial_state(estimate: StateEstimate, *, creeps: bool) -> Believed:
-    """Return the initial state of a plan, with or without creep."""
-    return estimate.stretch, estimate.rate, (
-        followed(estimate.values, estimate.stretch) if creeps else ())
+def initial_state(estimate: StateEstimate, model: JointModel, shift: float = 0.0) -> Believed:
+    """Return the initial state of a plan with a model, with positions shifted."""
+    stretch, rate, material = estimate.stretch, estimate.rate, model.material
+    apart = estimate.values['behind'][-2 - 2 * len(material.modes.ratios):] if (
+        material.modes.ratios) else (0.0, 0.0)
+    first, speed, *others = (y + x for x, y in zip(apart, itertools.cycle((stretch, rate))))
+    branches = followed(estimate.values, first) if material.creep else ()
+    return first + shift, speed, (*branches, *(
+        x * model.units.time if i % 2 else x + shift for i, x in enumerate(others)))
 
 
 def differs(model: JointModel, estimate: StateEstimate) -> bool:

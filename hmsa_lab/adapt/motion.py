@@ -49,7 +49,8 @@ class ModelMotion:
     rate: Array  # in 1/s, shape (n,)
     by: Array  # by the coordinates of the free parameters, and by initial stretch and rate
     rate_by: Array
-    #: Branch states minus the elastic force at the last time, in units of G.
+    #: At the last time: branch states minus the elastic force, in units of G, and with secondary
+    #: modes, position and rate of each mode minus those of all together.
     behind: tuple[float, ...]
 
 
@@ -59,10 +60,9 @@ def follow(
     """
     Simulate a motion from stretch and rate (1/s) at ``begin`` in s until the given times.
 
-    Before the begin the rate is constant. If ``creep`` is among the values, ``behind`` gives the
-    branch states minus the elastic force at the begin, in units of G; without it branches are
-    relaxed. Earlier levels count if the field lags. Return None if the motion meets the limits
-    of the chains.
+    Before the begin the rate is constant. If ``behind`` is among the values, it is that of
+    `ModelMotion` at the begin; without it branches are relaxed, and modes move together. Earlier
+    levels count if the field lags. Return None if the motion meets the limits of the chains.
     """
     setup = ResponseArguments.of(values, free, (derivatives.STRETCH, derivatives.RATE))
     theta, wanted = setup.theta, setup.wanted
@@ -81,8 +81,8 @@ def follow(
     n = len(times)
     stretch, rate = np.empty(n), np.empty(n)
     raw, raw_rate = np.empty((n, len(wanted))), np.empty((n, len(wanted)))
-    behind = np.array(values.get('behind') or (0.0,) * setup.branches)
-    behind_last = np.zeros(setup.branches)
+    behind = _behind(values, setup)
+    behind_last = np.zeros_like(behind)
     if not derivatives.respond(
             theta, setup.material, setup.branches, wanted, start, starts, heights, slopes, field,
             field_lag, times, _RTOL, stretch, rate, raw, raw_rate, behind, behind_last):
@@ -91,13 +91,20 @@ def follow(
         stretch, rate, raw @ setup.mixing, raw_rate @ setup.mixing, tuple(behind_last.tolist()))
 
 
+def _behind(values: Mapping[str, Any], setup: ResponseArguments) -> Array:
+    """Return `ModelMotion.behind` among values; a branch that was not in use is relaxed."""
+    given = values.get('behind', ())
+    return np.append(np.zeros(setup.states - len(given)), given)
+
+
 def followed(values: Mapping[str, Any], stretch: float) -> tuple[float, ...]:
     """Return the branch states at a stretch, in units of G; empty if relaxed."""
     holds = 'creep' in values or values['viscoelastic_ratio'] > 0.0
     if not (holds and any(values.get('behind', ()))):
         return ()
-    force = float(elastic_force(stretch, ResponseArguments.of(values, ()).material))
-    return tuple(force + x for x in values['behind'])
+    setup = ResponseArguments.of(values, ())
+    force = float(elastic_force(stretch, setup.material))
+    return tuple(force + x for x in _behind(values, setup)[:setup.branches].tolist())
 
 
 def held(
@@ -109,7 +116,7 @@ def held(
         return rest(values, (), level)
     theta = ResponseArguments.of(values, ()).theta
     a, k, f = theta[[derivatives.STIFFNESS, derivatives.DRIVE, derivatives.FORCE]]
-    ratios = theta[derivatives.FIRST_BRANCH::derivatives.BRANCH].tolist()
+    ratios = theta[derivatives.FIRST_BRANCH::derivatives.BRANCH][:len(by)].tolist()
     pull = k * level + f + a * sum(x * y for x, y in zip(ratios, by, strict=True))
     found = rest(values, (), float((pull / (1.0 + sum(ratios)) - f) / k))
     return found and (found[0], found[1] * math.sqrt(1.0 + sum(ratios)), found[2])

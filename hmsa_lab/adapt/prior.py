@@ -24,7 +24,6 @@ from hmsa.identification.quantities import (
 )
 from hmsa.model.equations import Array
 from hmsa.model.laws.record import Coordinate, coordinate_of
-from hmsa.model.modes import Modes
 from hmsa.model.parameters import ActuatorParameters
 from hmsa.model.thermal import BLOCK_COEFFICIENTS
 from hmsa_ros.runtime.records import TRACKED
@@ -127,9 +126,7 @@ class Prior:
                 x for x in SUSPECTS if x not in free and x not in without
                 and not (x == 'chain_limit' and elastic)
                 and not (x.startswith('viscoelastic') and any(actuator.creep.ratios))))
-        # Feedback does not model secondary modes.
-        values: dict[str, Any] = complete(values_of(
-            replace(actuator, modes=Modes()), others), free)
+        values: dict[str, Any] = complete(values_of(actuator, others), free)
         values['viscoelastic_time'] = _RELAXATION * actuator.time_unit
         if actuator.creep:
             values['creep'] = actuator.creep.held

@@ -40,8 +40,9 @@ struct Recorded {
     double rtol;
     double *stretch, *rate;  // (count,)
     double *jacobian, *by_rate;  // (count, wanted_count); the latter may be null
-    // Distance of the branch states from the elastic force at the start, and at the last time;
-    // null for zero, and if not needed.
+    // Distance of the branch states from the elastic force, and with secondary modes that of position
+    // and rate of each mode from those of all together, at the start, and at the last time; null for
+    // zero, and if not needed.
     const double *behind;
     double *behind_last;
     bool damping_varies() const  // whether the damping changes with the stretch
@@ -281,10 +282,13 @@ template <class C, class System, int NB = most_branches> struct Response {
         y[0] = plain(of.theta[stretch_of]), y[1] = seeded_at(rate_of);
         if constexpr (N > 0)
             each([&](int j, int) { incline(y[0], j, of.start[from + j]); });
+        const auto apart = [&](int i) { return of.behind ? of.behind[i] : 0; };
+        for (int w = 2 + creeping; w < width; w++)
+            y[w] = y[(w - creeping) % 2] + apart(w);
+        for (int i = 0; i < 2 && width > 2 + creeping; i++)
+            y[i] = y[i] + apart(creeping + i);
         for (int b = 0; b < creeping; b++)
-            y[2 + b] = system.force(y[0]) + (of.behind ? of.behind[b] : 0);
-        for (int w = 2 + creeping; w < width; w++)  // at first, all modes move together
-            y[w] = y[(w - creeping) % 2];
+            y[2 + b] = system.force(y[0]) + apart(b);
         level = of.levels[0], ramp = of.ramps[0], piece_begin = of.begins[0];
         excess = plain(of.field - level) + lag * ramp;
         if constexpr (N > 0)
@@ -304,6 +308,13 @@ template <class C, class System, int NB = most_branches> struct Response {
             if (i == of.count) {
                 for (int b = 0; of.behind_last && b < creeping; b++)
                     of.behind_last[b] = first(y[2 + b]) - first(system.force(y[0]));
+                if constexpr (modal)
+                    if (modes.count && of.behind_last) {
+                        S seen[2];
+                        modes.seen(y, y + 2 + creeping, seen[0], seen[1]);
+                        for (int w = creeping; w < width; w++)
+                            of.behind_last[w] = first(y[w < 2 + creeping ? w - creeping : w]) - first(seen[(w - creeping) % 2]);
+                    }
                 return true;
             }
             const double limit = piece + 1 < of.pieces ? of.begins[piece + 1] : infinity();
