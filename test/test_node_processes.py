@@ -58,10 +58,13 @@ BAD_OF_A_NODE = {
         'nothing_to_estimate': (
             ['--ros-args', '-p', 'feedback_parameters:=[]'],
             'parameter feedback_parameters: free parameter missing: expected some of'),
-        'feedback_of_one_mode': (
-            ['--ros-args', '-p', 'feedback:=adapt', '-p', 'modes.frequency_ratio:=[1.4]', '-p',
-             'modes.share:=[0.2]', '-p', 'modes.damping_ratio:=[0.1]'],
-            'parameter feedback is adapt and actuator has modes.*: expected observe or off'),
+        'feedback_of_a_beam_with_modes': (
+            ['--ros-args', '-p', 'feedback:=adapt', '-p', 'law.name:=beam', '-p',
+             'law.youngs_modulus:=1e6', '-p', 'law.width:=0.005', '-p',
+             'actuator.half_thickness:=0.001', '-p', 'modes.frequency_ratio:=[6.2]', '-p',
+             'modes.share:=[0.03]', '-p', 'modes.damping_ratio:=[0.1]'],
+            'parameter feedback is adapt and actuator is a beam with modes.*: expected observe '
+            'or off'),
         'limits_out_of_order': (
             ['--ros-args', '-p', 'flux_density_max:=-0.6'],
             'flux_density_min is -0.5 T: expected less than flux_density_max'),

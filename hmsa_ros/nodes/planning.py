@@ -11,7 +11,7 @@ from hmsa.identification.files import errors_from
 from hmsa.identification.quantities import check_free, Known
 from hmsa.interfaces import parameters as shared
 from hmsa.interfaces.actuator import planned_from
-from hmsa.interfaces.parameters import ParameterSpec
+from hmsa.interfaces.parameters import LAW_NAME, ParameterSpec
 from hmsa.judge.records import Tolerances
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.group import PlannerGroup
@@ -227,7 +227,7 @@ def settings_from(values: JointParameters) -> Settings:
     Raises
     ------
     BadInputError
-        If a name of feedback_parameters is unknown, or feedback is to correct an actuator that has
+        If a name of feedback_parameters is unknown, or feedback is to correct a beam that has
         secondary modes.
 
     """
@@ -235,12 +235,14 @@ def settings_from(values: JointParameters) -> Settings:
         'trajectory_mode', 'replan_late', 'after_cut_off', 'max_points', 'allow_partial_joints',
         'feedback', 'feedback_cautious', 'feedback_tolerance', 'feedback_trim', 'feedback_frozen',
         'feedback_file')}
-    modal = [x for x, y in values.each(lambda _, own: own['modes.frequency_ratio']).items() if y]
+    modal = [x for x, y in values.each(
+        lambda _, own: own['modes.frequency_ratio'] and own[LAW_NAME.name] == 'beam').items() if y]
     if modal and values['feedback'] in ('adapt', 'cautious'):
         raise BadInputError(
-            f'parameter feedback is {values["feedback"]} and {modal[0]} has modes.*: expected '
-            'observe or off, since feedback does not support secondary modes; hmsa identify fits '
-            'them to a recording, and hmsa learn corrects a sequence by its repeats')
+            f'parameter feedback is {values["feedback"]} and {modal[0]} is a beam with modes.*: '
+            'expected observe or off, since feedback does not support secondary modes of a beam; '
+            'hmsa identify fits them to a recording, and hmsa learn corrects a sequence by its '
+            'repeats')
     times: dict[str, Any] = {x: _nanoseconds(values[x]) for x in (
         'heartbeat_period', 'lateness_tolerance', 'takeover_timeout', 'takeover_max_age',
         'temperature_max_age')}
