@@ -468,6 +468,25 @@ def test_a_clock_that_is_ahead_is_named_and_leaves_no_vibration(ahead):
         assert it.estimates[-1].values['ahead_of_clock'] > 100
 
 
+@pytest.mark.parametrize('seed', [3, *(pytest.param(x, marks=pytest.mark.slow) for x in (0, 1))])
+def test_samples_in_bursts_with_timestamps_of_their_arrival_do_no_harm(seed):
+    left = {}
+    for mode in ('off', 'adapt'):
+        it, waiting = bench(
+            False, 1e-3, factors={'shear_modulus': 1.1}, seed=seed, feedback=mode), []
+
+        def bursts(time, stretch, waiting=waiting):
+            waiting.append(stretch)
+            if len(waiting) < 10:
+                return []
+            found = [(time + 20_000 * i, x) for i, x in enumerate(waiting)]
+            waiting.clear()
+            return found
+        it.sense = bursts
+        left[mode] = np.sum(np.abs(moves(it, (1.14, 1.3, 1.12))), axis=1)
+    assert np.all(left['adapt'] < left['off'] + 0.5)
+
+
 @pytest.mark.parametrize('seed', [0, *(
     pytest.param(x, marks=pytest.mark.slow) for x in (1, 2))])
 def test_an_update_costs_no_more_whatever_timestamps_come(seed, monkeypatch):
