@@ -30,9 +30,6 @@ _NEARLY_LOST = 0.3
 # Quantiles of the stretch between which errors of a continuum's model count as one draw: with
 # more parts, intervals missed the first frequency of finite elements more often.
 _PARTS = 1.0 / 3.0, 2.0 / 3.0
-# Standard deviation of the relative change of a continuum's first frequency with the amplitude
-# beyond that of the model, over its square: 0 to 1 on finite elements, free and glued.
-_BEYOND = 0.4
 # Fraction of a derivative below which the free parameters explain all of it; J_lim in place of an
 # infinite one.
 _HIDDEN, _LOOSE = 1e-10, 1e9
@@ -104,8 +101,7 @@ def _of_forms(
 
     Residuals do not show these errors of a block with modes, as other parameters compensate.
     J_lim, and how inertia and damping change with the stretch, have usual values where the
-    recording hardly shows them: the change is that to their optimum. The first frequency changes
-    with the amplitude otherwise than in uniform deformation, and those of other modes do not.
+    recording hardly shows them: the change is that to their optimum.
     """
     values, law = best.values, best.values['law']
     if law is not None and law.section:
@@ -113,7 +109,7 @@ def _of_forms(
     kept = [x for x in ('chain_limit', *BESIDES) if x not in best.free and x not in given
             and not (x == 'chain_limit' and law is not None)]
     response = respond(best.recording, {
-        **values, 'chain_limit': min(values['chain_limit'], _LOOSE)}, ('mass_factor', *kept))
+        **values, 'chain_limit': min(values['chain_limit'], _LOOSE)}, kept)
     if response is None:
         return np.empty((0, len(best.free)))
     added = best.root[:, None] * response.jacobian
@@ -124,14 +120,6 @@ def _of_forms(
         shown.T @ (best.root * best.residual), norms, out=np.zeros(len(norms)),
         where=norms > _HIDDEN * np.sum(added ** 2, axis=0))
     moves: Array = -(ways * sizes).T
-    # Where in the motion the frequency is determined, the amplitude is that of the speed.
-    weights = (columns @ (inverse @ ways[:, 0])) ** 2
-    speed = best.response.rate / (2.0 * math.pi * diagnosis.frequency_of(best))
-    change = _BEYOND * 2.0 * float(np.average(speed ** 2, weights=weights))
-    moves[0] = 2.0 * change * ways[:, 0]
-    for names in quantities.modes_of(values):
-        if names[0] in best.free:
-            moves[0, best.free.index(names[0])] += change
     return moves
 
 
