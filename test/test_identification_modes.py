@@ -332,6 +332,17 @@ def test_modes_of_a_block_that_change_with_the_stretch_are_the_computed_ones():
     assert 'times the first) with' in found.modes[0].words
 
 
+def test_a_latency_that_hardly_shows_beside_modes_is_part_of_the_intervals():
+    found = identify(
+        recorded(extras={'sensor_latency': 1e-4}, count=4), WITH_MODES, actuator=BLOCK)
+    assert found.verdict == 'identified', found.reason
+    assert any(x.found and x.remedy == 'sensor_latency' for x in found.signatures)
+    for name, true in (('mass_factor', TRUE.mass_factor), ('remanence', TRUE.remanence),
+                       ('damping_coefficient', TRUE.damping_coefficient)):
+        value = found.parameters[name]
+        assert value.low < true < value.high
+
+
 def test_without_modes_none_is_found():
     found = identify(recorded(replace(BLOCK, mass_factor=1.3)), WITH_MODES, actuator=BLOCK)
     assert found.verdict == 'identified', found.reason

@@ -404,7 +404,7 @@ def misfit(
         fit: Fit, found: Whiteness, marks: Sequence[Defect], alike: Repeated | None) -> str:
     """Return why the model is rejected, with numbers; empty if it is not."""
     motion = float(np.std(fit.recording.stretch))
-    tolerant = modal(fit) and not found.white
+    tolerant = modal(fit)
     seen = [x for x in marks if x.found and not (tolerant and x.share < _MOSTLY)]
     figures = (
         f'residuals of {fit.scale:.3g} with an autocorrelation of '
