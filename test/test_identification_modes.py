@@ -332,6 +332,19 @@ def test_modes_of_a_block_that_change_with_the_stretch_are_the_computed_ones():
     assert 'times the first) with' in found.modes[0].words
 
 
+def test_computed_modes_may_be_close_to_each_other():
+    tall = Actuator(half_thickness=26e-3, damping_ratio=0.04)
+    modes = tall.replace(mount='free').block.modes
+    true = replace(
+        tall.replace(mount='free').block, modes=replace(
+            modes, shares=(modes.shares[0], 0.06, modes.shares[2])))
+    assert modes.ratios[1] < 1.12 * modes.ratios[0]
+    found = identify(recorded(true, count=5), WITH_MODES, actuator=tall.block)
+    assert found.verdict == 'identified', found.reason
+    assert found.actuator.modes.ratios == pytest.approx(modes.ratios, rel=5e-3)
+    assert found.actuator.modes.shares == pytest.approx(true.modes.shares, rel=0.06)
+
+
 def test_a_latency_that_hardly_shows_beside_modes_is_part_of_the_intervals():
     found = identify(
         recorded(extras={'sensor_latency': 1e-4}, count=4), WITH_MODES, actuator=BLOCK)

@@ -69,8 +69,8 @@ _WHOLE = 0.9
 # Minimum improvement of chi-squared by a mode; and of the loss, as a fraction, if it leaves more
 # than noise: a mode of given damping stands for less else.
 _CHI_SQUARED, _PART, _PART_VISCOUS = 30.0, 0.15, 0.05
-# Ratio of two frequencies below which they are those of one mode that changes with the stretch;
-# and to the first, which a flat glued block has at 1.09 of it (benchmarks continuum).
+# Ratio of two frequencies below which fitted ones are those of one mode that changes with the
+# stretch; and to the first, which a flat glued block has at 1.09 of it (benchmarks continuum).
 _NEAR, _NEAR_FIRST = 1.122, 1.06
 # Lowest ratio of a mode of a beam: the second has 6.3 where straight, 3.6 where bent to 0.75.
 _OF_BEAMS = 2.5
@@ -368,18 +368,18 @@ def with_modes(
         wanted = (*wide, *names[:2 if viscous else 3])
         trials = [y for x in rows if (y := fit(
             recording, {**values, **dict(zip(names, x, strict=False))}, wanted,
-            most=_FEW)) is not None and possible(y)]
+            most=_FEW)) is not None and _apart(y)]
         if not trials:
             break
         found = min(trials, key=lambda x: loss(x.residual, best.scale))
         found = fit(recording, found.values, wanted, most=_FULL) or found
         found = _viscous(found) if viscous else found
-        if not (possible(found) and _better(best, found, _PART_VISCOUS if viscous else _PART)):
+        if not (_apart(found) and _better(best, found, _PART_VISCOUS if viscous else _PART)):
             break
         best, wide, values = found, found.free, found.values
         freed = fit(recording, values, (*wide, *(x[2] for x in SECONDARY[:i + 1])),
                     most=_FULL) if viscous else None
-        if freed is not None and possible(freed) and whiteness(
+        if freed is not None and _apart(freed) and whiteness(
                 freed.root * freed.residual).white:
             # Modes with dampings of their own explain all but noise; so may further ones.
             best, wide, values, viscous = freed, freed.free, freed.values, False
@@ -467,7 +467,7 @@ def narrower(
     if not modes or found.white or distant(best, found):
         return best
     # With dampings of their own from the start, two modes may oppose each other.
-    return next((x for x in (narrow, freed) if x is not None and possible(x) and _gain(
+    return next((x for x in (narrow, freed) if x is not None and _apart(x) and _gain(
         x, best)[1] < ENOUGH), best)
 
 
@@ -519,12 +519,18 @@ def _of_beam(values: Mapping[str, Any]) -> bool:
 def possible(found: Fit) -> bool:
     """Return whether the modes of a fit are those of an actuator."""
     values = found.values
-    modes = quantities.modes_of(values)
-    ratios = sorted((1.0, *(values[x[0]] for x in modes if values[x[2]] < BROAD)))
-    if len(ratios) > 1 and ratios[1] < _lowest(values):
-        return False
-    return all(y > (_NEAR_FIRST if x == 1.0 else _NEAR) * x for x, y in pairwise(ratios)) and sum(
-        abs(values[x[1]]) for x in modes) < _WHOLE
+    return all(x > max(_lowest(values), _NEAR_FIRST) for x in _ratios(values)) and sum(
+        abs(values[x[1]]) for x in quantities.modes_of(values)) < _WHOLE
+
+
+def _apart(found: Fit) -> bool:
+    """Return whether the modes of a fit are also too far apart to be one that changes."""
+    return possible(found) and all(y > _NEAR * x for x, y in pairwise(_ratios(found.values)))
+
+
+def _ratios(values: Mapping[str, Any]) -> list[float]:
+    """Return the frequency ratios of all modes but broad ones, in order."""
+    return sorted(values[x[0]] for x in quantities.modes_of(values) if values[x[2]] < BROAD)
 
 
 def _gain(before: Fit, after: Fit) -> tuple[float, float]:
