@@ -219,3 +219,14 @@ def test_recording_of_a_beam_that_bends_along_its_elastica_does_not_bias_the_rem
     assert remanence.value == pytest.approx(REMANENCE, rel=2e-3)
     assert found.actuator.law == beam.law
     assert any('along its elastica' in x for x in found.warnings)
+
+
+def test_a_beam_that_swings_beyond_its_elastica_asks_for_smaller_steps():
+    far = of_beam(TIMES, seen(), levels=1.4 * LEVELS)
+    shown = respond(far, values_of(along_elastica(BEAM), {'coil_time_constant': 0.02}), ())
+    assert np.max(np.abs(shown.stretch)) > 0.8
+    noise = 1e-3 * np.random.default_rng(0).standard_normal(len(TIMES))
+    found = identify(replace(far, stretch=shown.stretch + noise), actuator=BEAM)
+    assert found.verdict == 'model_rejected'
+    assert 'record steps half as large' in found.reason
+    assert '--free' not in found.reason
