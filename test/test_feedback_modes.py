@@ -3,7 +3,6 @@
 from dataclasses import replace
 from functools import partial
 
-import numpy as np
 import pytest
 
 from benchmarks import bench_harm, laboratory
@@ -12,8 +11,6 @@ from hmsa.api.facts import unquestioned
 from hmsa.model.modes import Modes
 from hmsa.model.simulation import ActuatorSimulation
 from hmsa.planning.planner import Options
-from hmsa_lab.adapt.estimator import Estimator
-from hmsa_lab.adapt.prior import Prior
 
 pytestmark = pytest.mark.thorough
 
@@ -97,23 +94,3 @@ def test_feedback_corrects_a_block_with_given_modes(way, weak, monkeypatch):
     assert min(x.size for x in plain) > 0.1
     assert corrected[0].size < 0.5 * plain[0].size
     assert max(x.size for x in corrected[1:]) < 0.03
-
-
-@pytest.mark.parametrize('share', [0.0, 0.05])
-def test_a_fast_mode_is_told_from_noise_by_few_samples(share):
-    # One sample says little about the next one: once feedback took this for G and a lag.
-    block = Actuator(half_length=0.01, damping_ratio=0.05, chain_limit=5.0).block
-    true = replace(block, modes=Modes((3.2,), (share,), (0.02,))) if share else block
-    every, begin = round(1e9 * block.period / 16.0), round(6e9 * block.period)
-    motion, estimator = ActuatorSimulation(true, time=0), Estimator(
-        Prior.nominal(block, suspects=True))
-    level = 0.25 * block.flux_density_unit
-    motion.command(begin, level)
-    estimator.set_levels([(0, 0.0), (begin, level)])
-    random, found = np.random.default_rng(0), []
-    for number in range(1, 12 * 16):
-        motion.advance(number * every)
-        estimator.sample(number * every, motion.stretch + 7e-4 * random.standard_normal())
-        if number % 8 == 0:
-            found.append(estimator.update(number * every).coherent)
-    assert any(found) is (share > 0.0)

@@ -73,7 +73,6 @@ _WARMER = 0.05
 _ROUNDED = 0.01
 # Natural period, in time scales, of a block of H/L = 1; slower ones need more time to be seen.
 _PERIOD = 2.565
-_LACKS = 'samples show motion that the model lacks, such as another mode'
 
 
 @dataclass(eq=False)
@@ -334,12 +333,9 @@ class AdaptiveJoint:
             return
         if found is not None and found.poor and trust.acts:
             trouble = trouble or 'samples fit worse than their noise'
-        lacks = found is not None and found.coherent and not trouble
-        if lacks and trust.acts:
-            trust.wait(now)
         self._anew &= found is None
         acted = trust.acts or trust.ended
-        if found is not None and not (trouble or lacks):
+        if found is not None and not trouble:
             trust.fits(plan, self._pace, estimator, now, waits=now < self.waits)
         if trouble and trust.doubt(
                 trouble, now, used=not self.sensor_changed, fitted=self._fitted > 0):
@@ -353,12 +349,12 @@ class AdaptiveJoint:
         elif found is not None and trust.acts and trust.failed and (
                 self._look_at_sensor(found, now, anew=not acted)):
             found = None
-        if not (trouble or lacks):
+        if not trouble:
             self._fitted = max(self._fitted, estimator.newest)
         if found is not None and not trust.why:
             self._look_at_vibration(plan, found)
-        if found is not None and (trust.why or lacks):
-            found = replace(found, trusted=False, trouble=trust.why or _LACKS)
+        if found is not None and trust.why:
+            found = replace(found, trusted=False, trouble=trust.why)
         self.latest, self.news = found, True
         trust.rang &= self.fitting is None
         if self.adapts and self.acting is not None:

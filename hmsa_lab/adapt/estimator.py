@@ -112,7 +112,6 @@ class StateEstimate:
     jump: int  # time in ns from which it has
     changed: float  # relative log odds that the sensor is not as before; see `Solution`
     poor: bool  # whether the newest samples fit worse than their noise
-    coherent: bool  # whether they leave more than noise
 
     @property
     def actuator(self) -> ActuatorParameters:
@@ -450,8 +449,7 @@ class Estimator:
             time, float(state[-2]), float(state[-1]), values, self.prior.free, deviations,
             covariance, off, found.instead, doubt, window.suspects.gain, self.noise,
             not trouble, trouble, found.jumped,
-            self._origin + round(found.jump * NANOSECONDS), found.changed, found.poor,
-            found.coherent)
+            self._origin + round(found.jump * NANOSECONDS), found.changed, found.poor)
 
     def _strange(self, z: Array) -> str:
         """Return a message on implausible parameters that samples would need; else empty."""

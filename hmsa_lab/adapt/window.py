@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hmsa.identification.fit import loss, robust_scale, weights_of
+from hmsa.identification.fit import loss, weights_of
 from hmsa.identification.quantities import complete, modes_of, quantity_of, TEMPERATURE, values_at
 from hmsa.identification.response import gain_of, sensed
 from hmsa.model.equations import Array
@@ -31,17 +31,10 @@ _MORE = 1.3
 # Mean negative log probability of a sample above which a fit is poor, its usual value, and the
 # number of standard deviations by which it surely differs from that.
 _POOR, _USUAL, _SURELY = 1.0, 0.5, 5.0
-# Time scales from the beginning of a window, and samples in them, in which residuals are compared
-# with their successors; number of successors; and the size of what follows as a fraction of the
-# motion: a mode with 7 % of the step leaves 0.01, creep and lag 7e-4 until they are known.
-_EARLY, _FEWEST, _LAGS, _MATTERS = 8.0, 20, 10, 0.004
-# The same with given secondary modes, where weaker ones are missing: on finite elements with the
-# modes of `free` or `glued`, they leave 0.3 to 3 % (RMS) of the motion. With 0.01, 2 of 12 random
-# blocks are not corrected, and 0.02 to 0.05 leave the same.
+# Motion that weak modes add to given secondary ones, as a fraction of it: on finite elements with
+# the modes of `free` or `glued`, 0.3 to 3 % (RMS). With 0.01, 2 of 12 random blocks are not
+# corrected, and 0.02 to 0.05 leave the same.
 _WEAK_MODES = 0.02
-# Residuals as a fraction of the simulated motion, above which there is none to compare with: in
-# test_temperature and test_feedback_modes 0.22 or more at rest, and at most 0.14 in motion.
-_MOVES = 0.2
 # Standard deviations of a jump of bias and gain of the sensor, and its prior improbability as a
 # logarithm.
 _JUMPS, _RARELY = np.array([0.05, 0.1]), 3.0
@@ -102,7 +95,6 @@ class Solution:
     # against that.
     changed: float = -math.inf
     poor: bool = False  # whether the samples fit worse than their noise
-    coherent: bool = False  # whether they leave more than noise
 
     @property
     def without_samples(self) -> 'Solution':
@@ -252,8 +244,7 @@ class Window:
         found = descend(z, here) or descend(self._at_ease(self.mean))
         if found is None:
             return None
-        if (len(self.time) >= _MORE * self.weighed or self._is_poor(found, noise)
-                or self._is_coherent(found)):
+        if len(self.time) >= _MORE * self.weighed or self._is_poor(found, noise):
             found = self._look(found, descend)
             if self._is_poor(found, noise):
                 # There may be another local optimum.
@@ -275,7 +266,7 @@ class Window:
         return Solution(
             found.z, found.here, sure * inverse(found.matrix, found.loose) + square,
             np.broadcast_to(off, z.shape), np.broadcast_to(instead, z.shape), doubt, self.jumped,
-            self.jump, self.changed, poor, self._is_coherent(found))
+            self.jump, self.changed, poor)
 
     def _doubt(self, found: Optimum) -> BiasCase:
         """Return the expectation if a constant force and a gain may be in error, too."""
@@ -342,26 +333,6 @@ class Window:
                         - 0.5 * float(off @ more @ off) + float(log_density))
         return (max(odds[0], odds[2]) - odds[1]) / float(
             self.before.log_density[0] - self.before.log_density[1])
-
-    def _is_coherent(self, found: Optimum) -> bool:
-        """Return whether residuals follow each other, as of motion that the model lacks."""
-        early = self.time < self.begin + _EARLY * found.here.values['time_unit']
-        left = found.here.residual[early]
-        if len(left) < _FEWEST:
-            return False
-        most = 3.0 * robust_scale(left)
-        left = np.minimum(np.maximum(left, -most), most)
-        count, square = len(left), float(left @ left)
-        moved = float(np.ptp((self.stretch - found.here.residual)[early]))
-        if not 0.0 < square < count * (_MOVES * moved) ** 2:
-            return False
-        # Of noise, chi-squared with as many degrees of freedom (G. E. P. Box and D. A. Pierce,
-        # J. Am. Stat. Assoc. 65 (1970) 1509); of a sinusoid, half the number of samples for each.
-        seen = count * sum(float(left[:-x] @ left[x:]) ** 2 for x in range(
-            1, _LAGS + 1)) / square ** 2 - _LAGS
-        return seen > _SURELY * math.sqrt(2.0 * _LAGS) and square * math.sqrt(
-            2.0 * seen / (_LAGS * count)) > count * (
-                (_WEAK_MODES if self.modal else _MATTERS) * float(np.ptp(self.stretch))) ** 2
 
     def _is_poor(self, found: Optimum, noise: float, more: float = 0.0) -> bool:
         """
