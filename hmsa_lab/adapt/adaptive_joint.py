@@ -45,8 +45,8 @@ _UPDATE, _OFTEN, RESTING = 20_000_000, 0.45, 200_000_000
 # from which it rings, and from which it rests.
 _SELDOM, _RINGING, _QUIET = 4, 3.0, 24.0
 # Samples used per natural period, of a joint among many, and the factor by which there are fewer
-# at rest; number that may follow each other faster after a pause, since those of a buffer with the
-# timestamps of their arrival show only together that these are wrong.
+# at rest; number that may follow each other faster after a pause while no estimate is in use:
+# only together those of a buffer with timestamps of their arrival show that these are wrong.
 _DENSE, _CROWDED, _SPARSE, _BURST = 40, 16, 10, 10
 # Time scales between two choices of the parameters to plan with.
 _CHOICE = 3.0
@@ -246,7 +246,8 @@ class AdaptiveJoint:
             _CROWDED if self.crowded else _DENSE)
         rests = self.latest and self._still(_QUIET * self.given.units.time)
         cell *= _SPARSE if rests else 1
-        self.next_sample = max(self.next_sample, self.newest - _BURST * cell) + cell
+        burst = 0 if self.trust.acts else _BURST * cell
+        self.next_sample = min(max(self.next_sample, self.newest - burst), self.newest) + cell
 
     def _is_ahead(self, stamp: int, now: int) -> bool:
         return stamp > now + _AHEAD * self.unit * NANOSECONDS
