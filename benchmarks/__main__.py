@@ -19,8 +19,9 @@ of an hour; line makes cables, boards, amplifiers and sensors fail there, for tw
 measures how many plans per second studies compute, for about seven minutes. lockstep compares the
 kernel of batches with C. continuum plays commands on finite elements, for eight minutes;
 compressible compares a compressible block with them, for three; predictions compares what plans
-predict there, for two; waves measures the amplitude of waves there, for five; beam plays commands
-on an exact rod, for three; beam-identification identifies recordings of this rod, for five.
+predict there, for two; waves measures the amplitude of waves there, for five; continuum-feedback
+moves blocks there with feedback, for five; beam plays commands on an exact rod, for three;
+beam-identification identifies recordings of this rod, for five.
 repeats plays what `hmsa learn` makes of repeats on finite elements and an exact rod, for half an
 hour.
 modes identifies secondary modes from recordings of these elements, for half an hour. adapting
@@ -66,7 +67,7 @@ TABLES |= {
     'lockstep': ('studies.lockstep',),
     'continuum': ('continuum.compare', 'continuum.little_damped'),
     'compressible': ('compressible.compare',), 'predictions': ('continuum.predicted',),
-    'waves': ('continuum.waves',),
+    'waves': ('continuum.waves',), 'continuum-feedback': ('continuum.followed',),
     'repeats': ('repeats.compare',), 'beam': ('beam.compare', 'beam.sequences'),
     'beam-identification': ('beam.identified',),
     'modes': ('continuum.covered', 'continuum.identified'), 'adapting': ('joints.adapting',)}

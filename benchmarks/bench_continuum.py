@@ -11,12 +11,15 @@ arrival, peak to peak, in % of the step.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 import math
 from typing import Any
 
 import numpy as np
 
+from benchmarks import bench_harm
 from benchmarks.block_elements import Block
+from benchmarks.laboratory import Bench, drawn, Plant
 from benchmarks.sheet import Sheet
 from hmsa import Actuator
 from hmsa.api.facts import unquestioned
@@ -227,6 +230,64 @@ def _amplitude(shape: float, paper: Actuator, actuator: Actuator, frequency: flo
     found, *_ = np.linalg.lstsq(np.column_stack([
         np.ones(len(angle)), np.sin(angle), np.cos(angle)]), stretch[middle])
     return float(np.hypot(*found[1:]))
+
+
+# Feedback: H/L, factor of the given shear modulus, whether the modes are given; targets, noise,
+# bias, and samples in a time scale. Largest error after the first move with modes, and largest
+# excess over open loop without, in % of the step.
+_FOLLOWED = ((0.5, 1.15, True), (1.0, 0.85, True), (2.0, 1.15, True), (1.0, 1.0, False))
+_MOVES, _SHOWN, _BIAS, _DENSE = (1.1, 1.2, 1.05), 5e-4, 1e-3, 12.0
+_CORRECTED, _WORSE = 5.0, 0.5
+
+
+class _Elements(Plant):
+    """A block on finite elements as a plant."""
+
+    def __init__(self, shape: float, paper: Actuator, _: Bench, time: int) -> None:
+        material = paper.model.material
+        self._elements = Block(
+            shape, J_LIM, material.zeta * material.c1 / 6.0, _MORE_SHAPES[shape])
+        self._units, self.time, self._level, self._stretch = paper.model.units, time, 0.0, 1.0
+        self.applied, self._levels = [], []
+
+    def _begin_with(self, level: float) -> None:
+        self._level = level
+
+    def _go_on(self, time: int) -> float:
+        if time > self.time and (self._level or self.applied):
+            _, stretch = self._elements.follow([(
+                1e-9 * (time - self.time) / self._units.time,
+                float(self._units.of_level(self._level)))])
+            self._stretch = float(stretch[-1])
+        self.time = time
+        return self._stretch
+
+
+def followed(*, quick: bool) -> Sheet:
+    """Return what moves leave in open loop and with feedback, with modes given or not."""
+    rows, figures, passed = [], [], True
+    for shape, factor, given in _FOLLOWED[1:2] if quick else _FOLLOWED:
+        paper, block = blocks(shape)
+        known = (block if given else paper).block
+        bench = replace(
+            drawn(0), given=replace(known, shear_modulus=factor * known.shear_modulus),
+            block=known, noise=_SHOWN, bias=_BIAS, period=paper.block.time_unit / _DENSE,
+            dropouts=0.0, targets=_MOVES)
+        left = {way: [100.0 * x.size for x in bench_harm.run(
+            bench, way, partial(_Elements, shape, paper), 'modal' if given else 'two_step')]
+            for way in bench_harm.WAYS}
+        plain, *corrected = left.values()
+        passed &= max(max(x[1:]) for x in corrected) <= _CORRECTED if given else (
+            float(np.max(np.subtract(corrected, plain))) <= _WORSE)
+        rows.append([
+            f'{shape:g}, {"its modes" if given else "none"}, {100.0 * (factor - 1.0):+.0f} %',
+            *(', '.join(f'{x:.1f}' for x in y) for y in left.values())])
+        figures.append({'shape': shape, 'factor': factor, 'modes': given, **left})
+    return Sheet(
+        'continuum_feedback',
+        'Vibration and steady-state error together, in % of the step, of three moves on finite '
+        f'elements, damping ratio {_RATIO:g}: to ' + ', '.join(f'{x:g}' for x in _MOVES),
+        ('H/L, given modes, error of G', *bench_harm.WAYS), rows, {'rows': figures}, passed)
 
 
 # Recordings for identification: targets of unshaped steps, periods on each, duration in s, rate in

@@ -10,7 +10,7 @@ the peak-to-peak vibration from its arrival on, or at its end if that is larger,
 from the target at its end.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 import os
@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.bounds import bound
-from benchmarks.laboratory import Bench, CHANGES, Device, drawn, GROUPS
+from benchmarks.laboratory import Bench, CHANGES, Device, drawn, GROUPS, Plant
 from benchmarks.sheet import Sheet
 from hmsa.planning.group import PlannerGroup
 from hmsa.planning.planner import Options, Planner
@@ -75,14 +75,17 @@ class Left:
         return self.vibration + self.offset
 
 
-def run(bench: Bench, way: str) -> list[Left]:
+def run(
+        bench: Bench, way: str, plant: Callable[[Bench, int], Plant] = Plant,
+        shaper: str = Options.shaper) -> list[Left]:
     """Carry out the moves of a bench."""
     unit = round(1e9 * bench.unit)
     lead = _LEADS[bench.seed // 2 % 2]
-    device = Device(bench, 1_000_000_000)
+    device = Device(bench, 1_000_000_000, plant)
     loop = Loop(
         PlannerGroup({'a': Planner(bench.given, Options(
-            flux_density_min=-_LIMIT, flux_density_max=_LIMIT, lead_time=lead))}),
+            flux_density_min=-_LIMIT, flux_density_max=_LIMIT, lead_time=lead,
+            shaper=shaper))}),
         Settings(takeover_timeout=0, heartbeat_period=0, **WAYS[way]), device)
     sent: list[Output] = []
     loop.deliver = sent.append

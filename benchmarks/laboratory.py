@@ -5,7 +5,7 @@ The motion follows Eq. 10 with a coil that lags, a viscoelastic branch and a con
 integrated by SciPy. Of the package, only the class of a block's parameters is used.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 import math
 
@@ -313,9 +313,10 @@ class Plant:
 class Device:
     """Actuator and sensor of a bench, for `hmsa_ros.runtime.loop.Loop`."""
 
-    def __init__(self, bench: Bench, time: int) -> None:
+    def __init__(
+            self, bench: Bench, time: int, plant: Callable[[Bench, int], Plant] = Plant) -> None:
         self.bench, self.time = bench, time
-        self.plant = Plant(bench, time)
+        self.plant = plant(bench, time)
         self._random = np.random.default_rng((28, bench.seed))
         self._measured = time  # of the last measurement
         self._period = round(1e9 * bench.period)

@@ -10,7 +10,6 @@ from hmsa import Actuator
 from hmsa.api.facts import unquestioned
 from hmsa.model.modes import Modes
 from hmsa.model.simulation import ActuatorSimulation
-from hmsa.planning.planner import Options
 
 pytestmark = pytest.mark.thorough
 
@@ -29,51 +28,43 @@ LABORATORIES = {
              (0.927,), 0.0442436, False, 'adapt', 110)}
 
 
-class Plant:
-    """A plant of `laboratory.Device` with a second mode."""
+class Plant(laboratory.Plant):
+    """A plant with secondary modes."""
 
-    truth = None
+    def __init__(self, truth, bench, time):
+        self.time, self.applied, self._levels = time, [], []
+        self._motion = ActuatorSimulation(truth, time=time)
 
-    def __init__(self, bench, time):
-        self.time, self.applied, self.field, self._levels = time, [], 0.0, []
-        self._motion = ActuatorSimulation(self.truth, time=time)
+    def _begin_with(self, level):
+        self._motion.command(self.time, level)
 
-    def command(self, stamp, level):
-        stamp = max(stamp, self.time)
-        self._levels = [*(x for x in self._levels if x[0] < stamp), (stamp, level)]
-
-    def advance(self, time):
-        while self._levels and self._levels[0][0] <= time:
-            stamp, self.field = self._levels.pop(0)
-            self._motion.command(stamp, self.field)
-            self.applied.append((stamp, self.field))
+    def _go_on(self, time):
         self._motion.advance(max(time, self._motion.time))
         self.time = time
         return self._motion.stretch
 
 
 @pytest.mark.parametrize('name', LABORATORIES)
-def test_feedback_leaves_no_more_than_open_loop_where_the_model_lacks_a_mode(name, monkeypatch):
+def test_feedback_leaves_no_more_than_open_loop_where_the_model_lacks_a_mode(name):
     (shape, zeta, noise, dense, mass, mode), targets, length, known, way, seed = (
         LABORATORIES[name])
     block = Actuator(half_length=length, half_thickness=length * shape, damping_ratio=zeta,
                      chain_limit=5.0).block
     true = replace(block, mass_factor=mass, modes=Modes(*((x,) for x in mode)))
-    monkeypatch.setattr(laboratory, 'Plant', Plant)
-    monkeypatch.setattr(Plant, 'truth', true)
     unit = block.time_unit
     bench = replace(
         laboratory.drawn(0), seed=seed, given=replace(
             block, mass_factor=mass if known else 1.0), block=block, noise=noise,
         period=unit / dense, delay=0.05 * unit, bias=0.0, dropouts=0.0, targets=targets)
-    plain, corrected = (bench_harm.run(bench, x) for x in ('open loop', way))
+    plain, corrected = (
+        bench_harm.run(bench, x, partial(Plant, true)) for x in ('open loop', way))
     excess = [y.size - x.size for x, y in zip(plain, corrected, strict=True)]
     assert max(excess) < 0.005
 
 
 @pytest.mark.parametrize('weak', [(), (2.9, 0.03, 0.1)])
 @pytest.mark.parametrize('way', ['adapt', 'cautious'])
-def test_feedback_corrects_a_block_with_given_modes(way, weak, monkeypatch):
+def test_feedback_corrects_a_block_with_given_modes(way, weak):
     # Once the modes were left out, and nothing was corrected; then a weak mode that the parameters
     # lack looked like a sensor that had changed.
     with unquestioned():
@@ -81,16 +72,15 @@ def test_feedback_corrects_a_block_with_given_modes(way, weak, monkeypatch):
             half_length=0.01, half_thickness=0.003, damping_ratio=0.05, chain_limit=5.0,
             mount='free').block
     modes = Modes.of_numbers([*block.modes.numbers[:2], *([(*weak, 0.0, 0.0)] if weak else [])])
-    monkeypatch.setattr(laboratory, 'Plant', Plant)
-    monkeypatch.setattr(Plant, 'truth', replace(block, modes=modes))
-    monkeypatch.setattr(bench_harm, 'Options', partial(Options, shaper='modal'))
     given = replace(block, shear_modulus=1.15 * block.shear_modulus, modes=Modes.of_numbers(
         modes.numbers[:2]))
     bench = replace(
         laboratory.drawn(0), seed=3, given=given, block=block, noise=5e-4,
         period=block.time_unit / 12.0, delay=0.05 * block.time_unit, bias=1e-3, dropouts=0.0,
         targets=(1.15, 1.06, 1.2))
-    plain, corrected = (bench_harm.run(bench, x) for x in ('open loop', way))
+    plain, corrected = (
+        bench_harm.run(bench, x, partial(Plant, replace(block, modes=modes)), 'modal')
+        for x in ('open loop', way))
     assert min(x.size for x in plain) > 0.1
     assert corrected[0].size < 0.5 * plain[0].size
     assert max(x.size for x in corrected[1:]) < 0.03
