@@ -282,12 +282,13 @@ def _children() -> float:
     return times.children_user + times.children_system
 
 
-def _process(command: list[str]) -> list[float]:
+def _process(command: list[str], **environment: str) -> list[float]:
     """Return elapsed and processor time of a command, and the numbers it prints."""
     before = _children()
     begin = perf_counter()
     done = subprocess.run(
-        command, cwd=ROOT, check=True, capture_output=True, text=True, timeout=600.0)
+        command, cwd=ROOT, check=True, capture_output=True, text=True, timeout=600.0,
+        env={**os.environ, **environment})
     span = perf_counter() - begin
     printed = [float(x) for x in done.stdout.split() if x.replace('.', '', 1).isdigit()]
     return [span, _children() - before, *printed]
@@ -301,6 +302,11 @@ def start_up(*, quick: bool = False) -> Sheet:
              'of that, importing', 'of that, the first plan')
     rows = [Row(name, '', min(times), statistics.median(times))
             for name, times in zip(names, zip(*runs, strict=True), strict=True)]
+    # Threads of the linear algebra library wait busily for work after the import of NumPy.
+    alone = [_process([sys.executable, '-c', _FIRST], OMP_NUM_THREADS='1')[1] for _ in runs]
+    rows.insert(2, Row(
+        'of that, with OMP_NUM_THREADS=1, as hmsa sets it', '', min(alone),
+        statistics.median(alone)))
     if not quick:
         rows += _installed()
     return table('start', 'Start', 'time', 'error', rows)
