@@ -23,7 +23,6 @@ from hmsa.identification.measurement import Measurement
 from hmsa.identification.result import Defect
 from hmsa.model import equations
 from hmsa.model.equations import Array
-from hmsa.model.laws.record import BEAMS
 
 # Numbers of random draws: first, and if the p-value is not clearly above a limit.
 _DRAWS, _CLEAR = (199, 3999), 0.04
@@ -457,8 +456,8 @@ def misfit(
 
 def _advice(fit: Fit, seen: Sequence[Defect] = ()) -> str:
     """Return what to record or to free."""
-    law, farthest = fit.values['law'], float(np.max(np.abs(fit.recording.stretch)))
-    if law is not None and law.family in BEAMS and farthest > _FAR:
+    farthest = float(np.max(np.abs(fit.recording.stretch)))
+    if quantities.of_beam(fit.values) and farthest > _FAR:
         return (
             f'; the beam swings to a deflection of {farthest:.2g}, and beyond {_FAR:g} it leaves '
             f'its elastica: {_SMALLER}')

@@ -28,7 +28,6 @@ from hmsa.identification.result import Mode
 from hmsa.model import equations
 from hmsa.model.continuum import mounted, SHAPES
 from hmsa.model.equations import Array
-from hmsa.model.laws.record import BEAMS
 from hmsa.model.modes import BROAD, Modes
 from hmsa.motion import derivatives
 
@@ -475,7 +474,7 @@ def _viscous(found: Fit) -> Fit:
     """Return a fit whose damping ratios grow with the frequency, as by a viscous stress."""
     for _ in range(_REPEATS):
         values, damping = found.values, max(_damping_ratio(found.values), _DAMPED[0])
-        fast = math.inf if _of_beam(values) else _FAST
+        fast = math.inf if quantities.of_beam(values) else _FAST
         dampings = {
             x[2]: min(damping * values[x[0]], BROAD)
             if values[x[0]] < fast and values[x[2]] < BROAD else BROAD
@@ -508,12 +507,7 @@ def _damping_ratio(values: Mapping[str, Any]) -> float:
 
 def _lowest(values: Mapping[str, Any]) -> float:
     """Return the lowest possible ratio of a secondary mode."""
-    return _OF_BEAMS if _of_beam(values) else 1.0
-
-
-def _of_beam(values: Mapping[str, Any]) -> bool:
-    law = values['law']
-    return law is not None and law.family in BEAMS
+    return _OF_BEAMS if quantities.of_beam(values) else 1.0
 
 
 def possible(found: Fit) -> bool:

@@ -17,7 +17,7 @@ from hmsa.model.compressible import BULK_RATIOS, condensed
 from hmsa.model.creep import CONSTANTS, Creep, Flow, FLOWS, MAXWELL
 from hmsa.model.equations import Array
 from hmsa.model.laws import LAWS
-from hmsa.model.laws.record import Constant, Elastic
+from hmsa.model.laws.record import BEAMS, Constant, Elastic
 from hmsa.model.modes import Modes
 from hmsa.model.parameters import ActuatorParameters, Geometry, NondimensionalParameters
 from hmsa.model.thermal import COLDEST, HOTTEST, Thermal
@@ -295,6 +295,12 @@ def values_of(
         'bulk_ratio': actuator.bulk_ratio, _EXPONENT: actuator.transverse_mass_exponent,
         **actuator.factors, **values_of_modes(actuator.modes),
         **others}
+
+
+def of_beam(values: Mapping[str, Any]) -> bool:
+    """Return whether values are those of a beam."""
+    law = values['law']
+    return law is not None and law.family in BEAMS
 
 
 def values_of_modes(modes: Modes) -> dict[str, float]:
