@@ -251,8 +251,8 @@ class _Pieces(Sequence[PlannedLevel]):
         """Return the levels with others in place of some."""
         first, last = bisect_right(self._ends, start), bisect_right(self._ends, end)
         before = self._ends[first - 1] if first else 0
-        joined = tuple(chain.from_iterable(self._pieces[first:last + 1]))
-        joined = (*joined[:start - before], *levels, *joined[end - before:])
+        after = self._ends[last] if last < len(self._ends) else len(self)
+        joined = (*self[before:start], *levels, *self[end:after])
         return _Pieces([*self._pieces[:first], *_cut(joined), *self._pieces[last + 1:]])
 
 

@@ -151,7 +151,8 @@ class RunningPlan:
         """Replace the plan from the start of a draft of this revision on; return the plan."""
         if draft is None:
             return self.plan
-        old, history, begin = self.caught_up(), self._history, draft.begin
+        old, begin = self.caught_up(), draft.begin
+        history = self._history
         kept = bisect_left(old.levels, begin, key=STAMP)
         begun = bisect_right(old.levels, now, key=STAMP)
         # Forget levels that were sent and are over, except the present one and those for which
