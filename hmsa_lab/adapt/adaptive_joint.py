@@ -103,7 +103,7 @@ class AdaptiveJoint:
     planning: int = 0  # how long planning a path took
     amplitude: float = 0.0  # largest vibration since the last arrival
     fresh: bool = False  # whether there are unprocessed samples
-    is_ahead: bool = False  # whether the timestamp of the last one is ahead of the clock
+    stamped_ahead: bool = False  # whether the timestamp of the last one is ahead of the clock
     looking: Iterator[None] | None = None  # the update under way
     spent: int = 0  # time spent on the update
     audits: list[SetpointSamples] = field(
@@ -235,8 +235,8 @@ class AdaptiveJoint:
             self.latest, self.news = None, True
             self.looked()
         sample = stamp, math.nan if lost else stretch, now
-        self.fresh, self.is_ahead = True, self._is_ahead(stamp, now)
-        if not self.is_ahead:
+        self.fresh, self.stamped_ahead = True, self._is_ahead(stamp, now)
+        if not self.stamped_ahead:
             self.newest = max(self.newest, min(stamp, now))
         if self.looking is None:
             self._take(*sample)

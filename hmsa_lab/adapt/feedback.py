@@ -275,7 +275,7 @@ class Feedback(Follower):
     def audit(self, name: str, hold: SetpointSamples) -> None:
         """Audit a setpoint of a joint, once all samples that have arrived are processed."""
         joint = self.joints.get(name)
-        if joint is not None and joint.doubted and not joint.is_ahead and (
+        if joint is not None and joint.doubted and not joint.stamped_ahead and (
                 hold.found is not None and hold.found.vibration > _RANG * hold.setpoint.step):
             joint.trust.rang = joint.news = True
         if joint is not None and joint.adapts and not joint.trust.ended and (
