@@ -279,15 +279,6 @@ def test_modal_takes_2_3_and_3_5_times_as_long_as_the_two_step_command_of_the_pa
             assert 0.95 * most < unit * move.duration / whole <= most
 
 
-def test_vibration_that_modal_is_said_to_leave_is_that_of_the_motion():
-    material = Actuator(mount='free').model.material
-    request = MoveRequest(State(1.0), 1.2, material)
-    move = get_shaper('modal')(request)
-    times = move.duration + np.linspace(0.0, 2.0 * math.pi / request.frequency, 400)
-    seen, _ = observed(sampled(move.levels, request.start, times, material), material)
-    assert remaining(request, move).vibration == pytest.approx(np.ptp(seen) / 0.2, rel=1e-2)
-
-
 def test_modal_without_modes_is_the_two_step_command():
     request = MoveRequest(State(1.0), 1.2, paper_actuator().nondimensional)
     assert get_shaper('modal')(request) == get_shaper('two_step')(request)
@@ -363,6 +354,27 @@ def test_vibration_of_a_tuned_two_step_is_predicted_to_a_fifth(shape, target, el
     request = MoveRequest(State(1.0), target, material)
     left = remaining(request, get_shaper('two_step')(request))
     assert 100.0 * left.vibration == pytest.approx(elements, rel=0.2)
+
+
+@pytest.mark.parametrize(('shape', 'target', 'elements'), [
+    (0.05, 0.9, 3.7), (0.3, 1.1, 2.7), (0.5, 1.1, 1.6), (1.0, 1.1, 1.9), (2.0, 1.2, 2.5)])
+def test_vibration_after_modal_is_predicted_to_a_factor_of_two(shape, target, elements):
+    # Measured on finite elements with a damping ratio of 0.02 (benchmarks continuum).
+    with unquestioned():
+        material = Actuator(
+            half_thickness=0.01 * shape, damping_ratio=0.02, chain_limit=5.0, mount='free',
+        ).model.material
+    request = MoveRequest(State(1.0), target, material)
+    left = remaining(request, get_shaper('modal')(request))
+    assert 0.5 * elements < 100.0 * left.vibration < 2.0 * elements
+
+
+@pytest.mark.parametrize(('order', 'told'), [(2, True), (3, False)])
+def test_modal_advises_a_higher_order_for_a_flat_block_of_little_damping(order, told):
+    with unquestioned():
+        block = Actuator(half_thickness=2e-3, damping_ratio=0.02, mount='free')
+    note, = block.plan([(1.1, 0.5)], 'modal', order=order).segments[0].notes()
+    assert note.endswith(': a higher robust_order leaves less') == told
 
 
 def test_modal_tells_of_weak_modes_alone_and_an_actuator_without_modes_of_nothing():

@@ -25,16 +25,18 @@ from hmsa.model.simulation import follow, longest_motion, observed, sampled
 from hmsa.model.status import Code, RefusedError
 from hmsa.motion import STRETCH
 from hmsa.planning.shapers import creeping, get_shaper
+from hmsa.planning.shapers.modal import weak_vibration
 from hmsa.planning.shapers.request import MoveRequest, Shaper, StepBudget
 
-# Samples of the first period after a move, and their tolerance; that of a state that fades.
-_SAMPLED, _RTOL, _FADING_RTOL = 100, 1e-7, 1e-5
-_TIMES: Array = np.linspace(0.0, 1.0, _SAMPLED, dtype=np.float64)
+# Samples of the first period after a move, and their tolerance.
+_SAMPLED, _RTOL = 100, 1e-7
 #: Vibration in fractions of the move below which nothing is told.
 TOLD = 5e-4
 # The same from which another shaper is advised, and from which that of an unshaped step is
 # computed, which may be less.
 _MUCH, _LIKE_A_STEP = 1e-2, 0.4
+# That after `modal` from which a higher order is advised (benchmarks continuum).
+_MUCH_OF_MODAL = 2e-2
 # Smaller moves have no meaningful fractions.
 _LEAST_MOVE = 1e-6
 #: Options for a setpoint that ends before the move to it.
@@ -70,8 +72,10 @@ class Remaining:
         if self.worse:
             return (f'{text}, and an unshaped step {_percent(self.step)}: expected the shaper '
                     'modal, which leaves least, or two_step')
-        return text + (': shaper modal leaves less' if self.vibration >= _MUCH and (
-            code is not Code.MODAL) else '')
+        if code is Code.MODAL:
+            return text + (
+                ': a higher robust_order leaves less' if self.vibration >= _MUCH_OF_MODAL else '')
+        return text + (': shaper modal leaves less' if self.vibration >= _MUCH else '')
 
 
 def _percent(fraction: float) -> str:
@@ -90,10 +94,13 @@ def remaining(request: MoveRequest, move: Move) -> Remaining | None:
     if size < _LEAST_MOVE or move.code is Code.HOLD or (
             move.code is Code.MODAL and request.material.ringing is request.material):
         return None
+    if move.code is Code.MODAL:
+        vibration, weak = weak_vibration(request, move)
+        return None if vibration < TOLD * size else Remaining(
+            vibration / size, weak + 2, modes.ratios[weak], broad=True)
     half = math.pi / request.frequency
     start = move.duration if move.duration < math.inf else move.levels[-1].time + half
-    after = _fading if move.code is Code.MODAL else _after
-    seen = after(request, move.levels, start, 2.0 * half)
+    seen = _after(request, move.levels, start, 2.0 * half)
     if seen is None:
         return None
     rows, whole = seen
@@ -108,34 +115,6 @@ def remaining(request: MoveRequest, move: Move) -> Remaining | None:
         step = left if left < vibration else math.nan
     broad = most > 0 and most - 1 not in modes.ringing
     return Remaining(vibration, most + 1, (1.0, *modes.ratios)[most], broad, step)
-
-
-def _fading(
-        request: MoveRequest, levels: Sequence[Level], start: float,
-        duration: float) -> tuple[list[Array], Array] | None:
-    """Return the result of `_after` where only modes that do not ring move, about the target."""
-    material, target = request.material, request.target
-    try:
-        found = sampled(
-            levels, request.start, np.array([start]), material, request.delivery,
-            _FADING_RTOL)[:, 0]
-    except HmsaError:
-        return None
-    state = found[motion.FOLLOWED + len(material.branches):]
-    modes, times = material.modes, duration * _TIMES
-    whole: Array = np.full(_SAMPLED, target)
-    rows = [whole] * (1 + len(modes.ratios))
-    for i, ((ratio, _, damping, exponent, _), share) in enumerate(zip(
-            modes.numbers, modes.at(target)[1:], strict=True)):
-        if i in modes.ringing:
-            continue
-        frequency = request.frequency * ratio * target ** exponent
-        rate = complex(-damping, math.sqrt(1.0 - damping ** 2)) * frequency
-        position, speed = state[2 * i] - target, state[2 * i + 1]
-        size = complex(position, (rate.real * position - speed) / rate.imag)
-        rows[i + 1] = target + (size * np.exp(rate * times)).real
-        whole = whole + share * (rows[i + 1] - target)
-    return rows, whole
 
 
 def _after(

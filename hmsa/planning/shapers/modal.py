@@ -22,6 +22,7 @@ import numpy as np
 from hmsa import motion
 from hmsa.model import law
 from hmsa.model.equations import Array
+from hmsa.model.modes import BROAD
 from hmsa.model.moves import Level, Move, State
 from hmsa.model.parameters import NondimensionalParameters
 from hmsa.model.simulation import followed_by
@@ -200,14 +201,45 @@ def _smooth(each: float, count: int, request: MoveRequest, weak: _Weak) -> Array
         for (ratio, _, own, exponent, _), share in zip(modes.numbers, shares[1:], strict=True))]
     fastest = max(x for x, _, _ in rings)
     mean, share = weak or (_UNKNOWN[0] * fastest, _UNKNOWN[1])
-    least = min(_ABOVE * fastest, _BELOW * mean)
-    band = least * (_WIDE * mean / least) ** _PLACES
+    band = _band(fastest, mean)
     others = np.stack([band, damping * band, np.full(_BAND, share / math.sqrt(_BAND))], axis=1)
     found = np.empty((1 + 2 * len(rings), count))
     solved = motion.smooth(
         frequency * each, len(rings), np.concatenate([np.array(rings), others]),
         _BENT[request.order > 2], found)
     return found if solved else None
+
+
+def _band(fastest: float, mean: float) -> Array:
+    """Return frequency ratios that weak modes may have, from the fastest one that rings."""
+    least = min(_ABOVE * fastest, _BELOW * mean)
+    band: Array = least * (_WIDE * mean / least) ** _PLACES
+    return band
+
+
+def weak_vibration(request: MoveRequest, move: Move) -> tuple[float, int]:
+    """
+    Return the expected vibration of weak modes after a move, and the index of most of it.
+
+    A mode that does not ring stands for many at any frequency near its mean, which have the
+    damping of a viscous material and keep more than it does. The vibration is from peak to peak,
+    the root mean square over these frequencies, in linear motion about the target.
+    """
+    packed, target, modes = request.material.packed, request.target, request.material.modes
+    damping = float(law.damping(target, packed) / law.mass(target, packed)) / (
+        2.0 * request.frequency)
+    fastest = max((1.0, *(
+        modes.ratios[i] * target ** modes.numbers[i][3] for i in modes.ringing)))
+    times, loads = np.array([(x.time, x.load) for x in move.levels]).T
+    changes = np.diff(loads, prepend=request.load) / float(law.elastic_stiffness(target, packed))
+    sizes = [0.0] * len(modes.ratios)
+    for i in set(range(len(sizes))) - set(modes.ringing):
+        band = _band(fastest, modes.ratios[i])
+        ratios = np.minimum(damping * band, BROAD)
+        rates = request.frequency * band * (1j * np.sqrt(1.0 - ratios ** 2) - ratios)
+        left = np.exp(np.outer(rates, move.duration - times)) @ changes
+        sizes[i] = 2.0 * abs(modes.at(target)[1 + i]) * float(np.sqrt(np.mean(np.abs(left) ** 2)))
+    return math.hypot(*sizes), int(np.argmax(sizes))
 
 
 def _around_two_steps(request: MoveRequest, holding: float) -> Iterator[Template]:
