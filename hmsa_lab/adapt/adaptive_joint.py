@@ -317,6 +317,8 @@ class AdaptiveJoint:
             self.estimator.unmeasured = now - stamp > self.settings.temperature_max_age
             self.estimator.warmed(celsius - self._thermometer)
             self._thermometer = celsius
+        self.estimator.may_soften = (
+            self.trust.acts and self.estimator.since > self.trust.begin)
         before = self.estimator.screening.lost
         estimator, found = yield from doing(_updated, self.estimator, now)
         estimator.learning, self.estimator = self.estimator.learning, estimator
@@ -565,14 +567,22 @@ class AdaptiveJoint:
         # A plan with changed parameters begins from an unknown state, so moves are not
         # interrupted.
         return not self.chosen and bool(self.planner.plan.segments) and (
-            latest.time < self.waits
+            latest.time < self.waits or self._softens(latest.time)
             or latest.time >= self.next_choice and self.shown(latest.time))
 
     def shown(self, time: int) -> bool:
         """Return whether samples until a time show how the joint has arrived."""
         plan = self.planner.plan
         place = plan.under_way(self.planner.soonest(time))
-        return place >= 0 and time >= self.shown_from(plan.segments[place])
+        return place >= 0 and (
+            time >= self.shown_from(plan.segments[place]) or self._softens(time))
+
+    def _softens(self, time: int) -> bool:
+        """Return whether the modulus has jumped since the setpoint under way at a time began."""
+        plan = self.planner.plan
+        place = plan.under_way(self.planner.soonest(time))
+        return place >= 0 and plan.segments[place].path is None and (
+            self.estimator.softening > plan.segments[place].since)
 
     def shown_from(self, segment: PlannedSegment) -> int:
         """Return the time from which samples show how the joint has arrived at a setpoint."""

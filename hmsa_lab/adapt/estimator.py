@@ -33,7 +33,7 @@ from hmsa_lab.adapt.hypotheses import hypotheses
 from hmsa_lab.adapt.motion import follow, Levels, ModelMotion, rest
 from hmsa_lab.adapt.prior import Prior
 from hmsa_lab.adapt.screening import Screening
-from hmsa_lab.adapt.window import BiasCase, Rest, Simulation, Solution, Window
+from hmsa_lab.adapt.window import BiasCase, Rest, Simulation, SOFTER, Solution, Window
 
 # Initial noise, before it is estimated, and minimum noise.
 _FIRST_NOISE, _LEAST_NOISE = 1e-3, 2e-6
@@ -62,6 +62,9 @@ _AT_REST, _ANYWHERE, _SETTLED = 2e-6, 0.3, 25.0
 _CALM = 12.0
 # Change of level, relative to the largest one, up to which it is a correction of a move.
 _CORRECTS = 0.1
+# Log odds from which the modulus has jumped, and maximum number of samples in a row that do not
+# fit and may show this.
+_JUMPED, _REFUSED = 6.0, 100
 # Maximum number of windows of samples that wait for an update.
 _WAITING = 10
 #: Standard deviations above which a suspected viscoelastic branch is used.
@@ -110,6 +113,7 @@ class StateEstimate:
     trouble: str  # reason if not; else empty
     jumped: float  # log odds that the sensor has changed since the last move began
     jump: int  # time in ns from which it has
+    softening: int  # time in ns of the last jump of the modulus
     changed: float  # relative log odds that the sensor is not as before; see `Solution`
     poor: bool  # whether the newest samples fit worse than their noise
 
@@ -176,6 +180,9 @@ class Estimator:
         self.screening = Screening(self.options.gate, prior.coordinate)
         # If False, parameters stay fixed from the next update on.
         self.learning = self.options.learn
+        # Whether the modulus may jump: until a whole move has fitted, a mode that is missing looks
+        # like that.
+        self.may_soften = False
         self.unmeasured = True  # whether the temperature may change without a measurement
         self._levels: list[tuple[int, float]] = []
         self._origin = 0
@@ -197,6 +204,8 @@ class Estimator:
         # Covariance of the parameters while they are fixed.
         self._fixed: Array | None = None
         self._warmed = 0.0  # change of the measured temperature in K since the window began
+        self._refused: list[tuple[int, float]] = []  # samples that do not fit since others did
+        self.softening = 0  # time in ns of the last jump of the modulus
 
     @property
     def since(self) -> int:
@@ -266,6 +275,11 @@ class Estimator:
         window.settle(z, _AT_REST)
         here = self._take(window, levels, until)
         found = window.solve(z, levels, window.scatter(self.noise), until, here)
+        if found is not None and window.first:
+            found = replace(found, jumped=-math.inf)
+        elif found is not None:
+            found, until = self._with_jump(window, found, levels, until)
+            window = self._window
         if found is None or np.any(np.diag(found.covariance) < 0.0):
             self.screening.trouble = 'no motion leads through the samples'
             return None
@@ -275,6 +289,34 @@ class Estimator:
         self._go_along(window, found, until)
         self._solution = self._solution.without_samples
         return estimate
+
+    def _with_jump(
+            self, window: Window, found: Solution, levels: Levels, until: float
+    ) -> tuple[Solution | None, float]:
+        """Return the solution after a jump of the modulus, if there was one, and its time in s."""
+        trouble = self.screening.trouble
+        if not self.may_soften or self._fixed is not None or (
+                'repeats' in trouble or not len(window.time)):
+            return replace(found, softened=-math.inf), until
+        refused = self._refused if trouble else []
+        if refused:
+            wider = window.wider([(self._seconds(x), y) for x, y in refused])
+            odds, time = wider.softer(found.z, levels, wider.scatter(self.noise), until)
+            found = replace(found, softened=odds, softening=time)
+        if found.softened <= _JUMPED:
+            return found, until
+        stamp = self._origin + round(until * NANOSECONDS)
+        self._solution, self._refused = found, []
+        self.softening = self._origin + round(found.softening * NANOSECONDS)
+        self.screening.restart()
+        self._go_along(window, found, until)
+        window = (self._window or window).wider([(self._seconds(x), y) for x, y in refused])
+        # Another jump during the same move is improbable.
+        window.first = True
+        window.settle(self._solution.z, _AT_REST)
+        self._window, until = window, self._seconds(stamp)
+        return window.solve(
+            self._solution.z, self._as_levels(), window.scatter(self.noise), until), until
 
     def predict(self, time: int) -> StateEstimate | None:
         """
@@ -415,7 +457,11 @@ class Estimator:
         fits = self.screening.fitting(
             window.stretch[new], here.residual[new], here.by[new], found.covariance, noise)
         if np.all(fits):
+            self._refused = []
             return here
+        self._refused = [*self._refused, *(
+            (self._origin + round(float(window.time[i]) * NANOSECONDS), float(window.stretch[i]))
+            for i in new[~fits])][-_REFUSED:]
         window.time, window.stretch = (
             np.delete(x, new[~fits]) for x in (window.time, window.stretch))
         return None
@@ -449,7 +495,8 @@ class Estimator:
             time, float(state[-2]), float(state[-1]), values, self.prior.free, deviations,
             covariance, off, found.instead, doubt, window.suspects.gain, self.noise,
             not trouble, trouble, found.jumped,
-            self._origin + round(found.jump * NANOSECONDS), found.changed, found.poor)
+            self._origin + round(found.jump * NANOSECONDS), self.softening,
+            found.changed, found.poor)
 
     def _strange(self, z: Array) -> str:
         """Return a message on implausible parameters that samples would need; else empty."""
@@ -465,7 +512,10 @@ class Estimator:
         span = _LONGEST * here.values['time_unit']
         # A whole move is fitted at once, since early in one linearisation would be inaccurate.
         before = int(np.searchsorted(window.time, self._seconds(self._move_begins(until))))
-        if before > 1:
+        softer = found.softened > _JUMPED
+        if softer:
+            place = min(int(np.searchsorted(window.time, found.softening)), count - 1)
+        elif before > 1:
             place = before - 1
         elif count > self.options.window or (
                 count >= _FEWEST and float(window.time[-1]) - window.begin > span):
@@ -484,13 +534,20 @@ class Estimator:
         drift[-2:] = _AT_REST ** 2, (_AT_REST / here.values['time_unit']) ** 2
         if self._fixed is None:
             drift[:-2] = self._drift(time - window.begin)
+        if softer:
+            drift[self.prior.free.index('shear_modulus')] += SOFTER ** 2
+            # It has moved since a time between two samples.
+            since = max(found.softening, time) - float(window.time[max(place - 1, 0)])
+            unit = here.values['time_unit']
+            drift[-2:] += np.square(
+                2.0 * SOFTER * since / unit * np.array([since / unit, 1.0 / unit]))
         follows = self._with_rest(here.values, time)
         wander, warming = follows @ np.diag(drift) @ follows.T, self._warming(follows)
         shift = round(time * NANOSECONDS)
         seconds = shift / NANOSECONDS
         # Later motion shows how equilibrium depends on parameters.
         at = window.rest if self.learning is (self._fixed is None) and self._unchanged(
-            self._origin, self._origin + shift, 0.0) and not self._warmed else None
+            self._origin, self._origin + shift, 0.0) and not (self._warmed or softer) else None
         noise = window.scatter(self.noise)
         moved = window.move_on(
             place, time, found.z, here, noise, wander, warming) if at is None else (

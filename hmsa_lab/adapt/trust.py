@@ -37,7 +37,8 @@ class Trust:
         # changed, and not its sensor.
         self.rang = False
         self.ended = False  # whether learnt parameters made moves worse
-        self.begin = begin  # time in ns from which a move has to fit
+        # Time in ns from which a move has to fit, or from which the estimate has been used.
+        self.begin = begin
         self._doubts = 0
         self._failed = False  # whether an estimate that fitted has failed later
 
@@ -77,6 +78,7 @@ class Trust:
             begin = _next_move(plan, self.begin, now)
             span = round((_EARLY if waits else _SHOWN) * unit * NANOSECONDS)
             self.acts = begin + span <= now and estimator.count_since(begin) >= _FEWEST
+            self.begin = now if self.acts else self.begin
         if self.acts or not self.beginnings:
             self.why = ''
 

@@ -7,7 +7,8 @@ it are added to the prior at the present estimate, and the prior is propagated a
 (C. V. Rao, J. B. Rawlings and D. Q. Mayne, IEEE Trans. Autom. Control 48 (2003) 246).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 import math
 from typing import Any, NamedTuple
@@ -38,6 +39,10 @@ _WEAK_MODES = 0.02
 # Standard deviations of a jump of bias and gain of the sensor, and its prior improbability as a
 # logarithm.
 _JUMPS, _RARELY = np.array([0.05, 0.1]), 3.0
+#: Standard deviation of a jump of the modulus, as a logarithm: half of that before any sample.
+SOFTER = 0.075
+# Part of a change of the state up to which its effect on later motion is accurate (`motion`).
+_FADED = 1e-4
 # Maximum change per step of a coordinate that is a logarithm.
 _STRIDE = 0.3
 
@@ -91,6 +96,8 @@ class Solution:
     doubt: BiasCase
     jumped: float = -math.inf  # log odds that the sensor jumped before or in the window
     jump: float = 0.0  # when it did
+    softened: float = -math.inf  # log odds that the modulus jumped in the window
+    softening: float = 0.0  # when it did
     # Log odds that the sensor is not as before, if it may not be, relative to the possible ones
     # against that.
     changed: float = -math.inf
@@ -153,6 +160,8 @@ class Window:
     # As in `Solution`, when the suspects were weighed.
     jumped: float = -math.inf
     jump: float = 0.0
+    softened: float = -math.inf
+    softening: float = 0.0
     changed: float = -math.inf
     before: SensorBefore | None = None  # of a sensor that may have changed
     known: tuple[int, ...] = field(init=False)  # suspects estimated in earlier windows
@@ -257,7 +266,7 @@ class Window:
                     found = other
                 else:
                     self.suspected, self.others = before
-            self.jumped, self.jump = self._sensor_jumped(found, noise)
+            self._look_for_jumps(found, noise)
             self.changed = self._sensor_changed(found)
         sure, off, square, instead = self.others
         doubt = self._doubt(found)
@@ -266,7 +275,7 @@ class Window:
         return Solution(
             found.z, found.here, sure * inverse(found.matrix, found.loose) + square,
             np.broadcast_to(off, z.shape), np.broadcast_to(instead, z.shape), doubt, self.jumped,
-            self.jump, self.changed, poor)
+            self.jump, self.softened, self.softening, self.changed, poor)
 
     def _doubt(self, found: Optimum) -> BiasCase:
         """Return the expectation if a constant force and a gain may be in error, too."""
@@ -275,24 +284,87 @@ class Window:
         off = covariance @ found.gradient
         return BiasCase(off, covariance + np.outer(off, off))
 
-    def _sensor_jumped(self, found: Optimum, noise: float) -> tuple[float, float]:
+    def wider(self, samples: Sequence[tuple[float, float]]) -> 'Window':
+        """Return the window with further samples (time in s, stretch)."""
+        found = copy(self)
+        if samples:
+            time, stretch = np.array(samples).T
+            place = np.searchsorted(self.time, time)
+            found.time = np.insert(self.time, place, time)
+            found.stretch = np.insert(self.stretch, place, stretch)
+        return found
+
+    def softer(
+            self, z: Array, levels: Levels, noise: float, until: float) -> tuple[float, float]:
+        """Return the log odds at coordinates that the modulus has jumped, and when."""
+        here = self.simulate(z, levels, noise, until)
+        if here is None:
+            return -math.inf, self.begin
+        self._look_for_jumps(Optimum(
+            z, here, *self._slopes(z, here, noise), np.ones(len(z), dtype=np.bool_)), noise)
+        return self.softened, self.softening
+
+    def _slopes(self, z: Array, here: Simulation, noise: float) -> tuple[Array, Array]:
+        """Return second derivatives of the cost, and the negative first ones."""
+        weighted = here.weights[:, None] * here.by / noise ** 2
+        return (self.information + here.by.T @ weighted,
+                weighted.T @ here.residual + self.information @ (self.mean - z))
+
+    def _look_for_jumps(self, found: Optimum, noise: float) -> None:
         """
-        Return the log odds that bias and gain of the sensor jumped, and when.
+        Weigh that bias and gain of the sensor jumped, or the modulus.
 
         They jumped before the window, or at one of its samples, all of which are as probable. The
-        rival is that all is as in earlier windows, or as their samples leave open.
+        rival is that all is as in earlier windows, or as their samples leave open. Before the
+        first motion, a sensor may have jumped at a sample at rest.
         """
-        if self.first or not len(self.time):
-            return -math.inf, self.begin
+        self.jumped, self.softened = -math.inf, -math.inf
+        if len(self.time) <= self.first or self.first and (
+                self.rest is None or TEMPERATURE in self.free):
+            return
         here = found.here
+        rival = Evidence(
+            self.suspects, found.z, found.matrix, found.gradient, *self._room(found.z))
         shown = self.stretch - here.residual - coordinate_of(here.values['law']).rest
-        jump = np.column_stack([np.ones(len(shown)), shown])
+        self.jumped, self.jump = self._best_jump(found, rival, self._sums(
+            here, noise, np.column_stack([np.ones(len(shown)), shown])), _JUMPS)
+        self.jumped -= rival.best()
+        # A block that warms changes in the course of time, and weak modes look like a change.
+        if not (self.first or self.modal or TEMPERATURE in self.free) and (
+                'shear_modulus' in self.free):
+            self.softened, self.softening = self._best_jump(
+                found, rival, self._sums_of_modulus(here, noise), np.array([SOFTER]))
+            self.softened -= rival.best() + max(self.jumped, 0.0)
+
+    def _sums(self, here: Simulation, noise: float, jump: Array) -> tuple[Array, Array, Array]:
+        """Return derivatives of the cost by m quantities that add to later readings."""
         weighted = here.weights[:, None] * jump / noise ** 2
-        # Derivatives of the cost by a jump at each sample.
         across, square, pull = (np.cumsum(x[::-1], axis=0)[::-1] for x in (
             here.by[:, :, None] * weighted[:, None], jump[:, :, None] * weighted[:, None],
             here.residual[:, None] * weighted))
-        square = square + np.diag(_JUMPS ** -2)
+        return across, square, pull
+
+    def _sums_of_modulus(self, here: Simulation, noise: float) -> tuple[Array, Array, Array]:
+        """Return as `_sums` for a modulus that differs from a sample on."""
+        motion, count = here.motion, len(self.time)
+        place = self.free.index('shear_modulus')
+        state = np.stack([motion.by[:count], motion.rate_by[:count]], axis=1)
+        size = np.linalg.norm(state[:, :, -2:], axis=(1, 2))
+        state = state[:int(np.argmin(np.append(size, 0.0) > _FADED * size[0]))]
+        # What it changes of later motion, less what it would have changed of the state until then.
+        less = np.linalg.solve(state[:, :, -2:], state[:, :, [place]])
+        way = np.concatenate([np.ones((len(state), 1, 1)), -less], axis=1)
+        across, square, pull = (x[:len(state)] for x in self._sums(
+            here, noise, here.by[:, [place, -2, -1]]))
+        return (across @ way, np.swapaxes(way, 1, 2) @ square @ way,
+                (pull[:, None, :] @ way)[:, 0])
+
+    def _best_jump(
+            self, found: Optimum, rival: Evidence, sums: tuple[Array, Array, Array],
+            sizes: Array) -> tuple[float, float]:
+        """Return the log probability of a jump of one or more quantities, and when it was."""
+        across, square, pull = sums
+        square = square + np.diag(sizes ** -2)
         # The time is the most probable one with the suspects of earlier windows.
         inner = inverse(found.matrix, self.suspects.sought(len(found.z), self.known))
         step = self.suspects.at_ease(found.z, self.known) - found.z
@@ -304,15 +376,17 @@ class Window:
         if TEMPERATURE in self.free:
             # A block that warms or cools moves within the window, too.
             gain = gain[:1]
+        if self.first:
+            # Before, any bias and gain are as given.
+            gain[0] = -math.inf
         best = int(np.argmax(gain))
-        rival = Evidence(
-            self.suspects, found.z, found.matrix, found.gradient, *self._room(found.z))
-        jumped, place = max(
+        odds, place = max(
             (rival.with_more(across[k, :, :n], square[k, :n, :n], pull[k, :n]).best()
-             - float(np.sum(np.log(_JUMPS[:n]))) + share, k)
-            for k, share in ((0, 0.0), (best, math.log(np.mean(np.exp(gain - gain[best])))))
-            for n in (1, 2))
-        return jumped - rival.best() - _RARELY, float(self.time[place]) if place else self.begin
+             - float(np.sum(np.log(sizes[:n]))) + share, k)
+            for k, share in (
+                (0, 0.0), (best, math.log(np.mean(np.exp(gain - gain[best])))))[self.first:]
+            for n in range(1, len(sizes) + 1))
+        return odds - _RARELY, float(self.time[place]) if place else self.begin
 
     def _sensor_changed(self, found: Optimum) -> float:
         """
@@ -366,9 +440,7 @@ class Window:
         if here is None:
             return None
         for number in range(_PASSES + 1):
-            weighted = here.weights[:, None] * here.by / noise ** 2
-            matrix = self.information + here.by.T @ weighted
-            gradient = weighted.T @ here.residual + self.information @ (self.mean - z)
+            matrix, gradient = self._slopes(z, here, noise)
             step, loose = self._step(z, matrix, gradient)
             if float(step @ matrix @ step) < _SMALL ** 2:
                 z = z + step
