@@ -339,6 +339,12 @@ def test_a_modulus_that_jumps_in_a_hold_is_found_and_the_hold_corrected_at_once(
     assert max(x.size for x in left[laboratory.change.move:]) < 0.01
 
 
+def test_a_bias_that_jumps_at_rest_before_the_first_move_is_not_taken_for_a_force():
+    it = bench(False, noise=1e-3)
+    it.sense = lambda time, x: [(time, x + 0.002)]
+    assert np.max(np.abs(moves(it, (1.14, 1.29, 1.13, 1.39, 1.12)))) < 0.1
+
+
 @pytest.mark.parametrize('modulus', [pytest.param(1.0, marks=pytest.mark.slow), 1.1])
 def test_a_small_bias_that_jumps_and_stays_costs_nothing(modulus):
     it = bench(False, noise=1e-3, factors={'shear_modulus': modulus})

@@ -348,7 +348,7 @@ class AdaptiveJoint:
             # a move confirms one, a mode that the model lacks looks like a sensor that changes.
             self._restart(self._since if trust.confirmed is None else (
                 found.jump if found is not None and jumped else max(
-                    estimator.since, self._fitted if acted else 0)))
+                    estimator.since, self._fitted if acted else 0)), jumped=jumped)
         elif found is not None and trust.acts and trust.failed and (
                 self._look_at_sensor(found, now, anew=not acted)):
             found = None
@@ -377,14 +377,14 @@ class AdaptiveJoint:
         if warmth is not None and abs(celsius - warmth.temperature) > _WARMER:
             self.planner.take_temperature(celsius, now, estimated=True)
 
-    def _restart(self, since: int, *, healthy: bool = False) -> None:
+    def _restart(self, since: int, *, healthy: bool = False, jumped: bool = False) -> None:
         """
         Restart the estimator with the samples kept from a time in ns on, and another explanation.
 
         With parameters learnt, the first one is the actuator and the sensor as given. The second
         one is a sensor that has changed, and the actuator as moves have confirmed it. If both have
         been tried with these samples, later ones are explained. If ``healthy``, the sensor is as
-        given, and the actuator as confirmed.
+        given, and the actuator as confirmed. Before, a sensor that has ``jumped`` has any bias.
         """
         model = self.trust.confirmed or self.given
         ways = [False] * (self._learnt or not self.trust.failed) + [True] * self.trust.failed
@@ -396,6 +396,8 @@ class AdaptiveJoint:
             prior = self.prior if not self.sensor_changed else Prior.of_changed_sensor(
                 model.actuator, self.settings.feedback_parameters, self._known,
                 others=model.others, bias=self._bias)
+        if jumped and self.trust.confirmed is None:
+            prior = prior.with_any_bias
         self._anew = bool(left) and not healthy
         if not (healthy or left):
             self._tried.clear()

@@ -62,8 +62,8 @@ _AT_REST, _ANYWHERE, _SETTLED = 2e-6, 0.3, 25.0
 _CALM = 12.0
 # Change of level, relative to the largest one, up to which it is a correction of a move.
 _CORRECTS = 0.1
-# Log odds from which the modulus has jumped, and maximum number of samples in a row that do not
-# fit and may show this.
+# Log odds from which the modulus, or the sensor before the first motion, has jumped, and maximum
+# number of samples in a row that do not fit and may show this.
 _JUMPED, _REFUSED = 6.0, 100
 # Maximum number of windows of samples that wait for an update.
 _WAITING = 10
@@ -188,9 +188,11 @@ class Estimator:
         self._origin = 0
         self.restart(prior)
 
-    def restart(self, prior: Prior, *, settled: bool = True) -> None:
+    def restart(
+            self, prior: Prior, samples: Sequence[tuple[int, float]] = (), *, settled: bool = True
+    ) -> None:
         """
-        Discard all estimates, and begin with a prior; counts and levels stay.
+        Discard all estimates, and begin with a prior, and samples; counts and levels stay.
 
         Unless ``settled``, a block that has rested need not be at the equilibrium of its level.
         """
@@ -198,7 +200,7 @@ class Estimator:
         # That of a sensor which repeats a value would be none.
         self.noise = self.options.noise or _FIRST_NOISE
         self.screening.restart()
-        self._pending: list[tuple[int, float]] = []
+        self._pending = list(samples)
         self._window: Window | None = None
         self._solution: Solution | None = None
         # Covariance of the parameters while they are fixed.
@@ -275,6 +277,15 @@ class Estimator:
         window.settle(z, _AT_REST)
         here = self._take(window, levels, until)
         found = window.solve(z, levels, window.scatter(self.noise), until, here)
+        jumped = found is not None and window.first and found.jumped > _JUMPED
+        if found is not None and jumped and self._unchanged(
+                self._origin, self._origin + round(until * NANOSECONDS), 0.0):
+            # What a sensor showed until it jumped does not count.
+            self.restart(self.prior.with_any_bias, [
+                (self._origin + round(x * NANOSECONDS), y) for x, y in zip(
+                    window.time.tolist(), window.stretch.tolist(), strict=True)
+                if x >= found.jump], settled=self._settled)
+            return self.update(time)
         if found is not None and window.first:
             found = replace(found, jumped=-math.inf)
         elif found is not None:

@@ -199,6 +199,16 @@ class Prior:
         """Return the prior of the same block at a temperature in degrees Celsius."""
         return replace(self, values={**self.values, TEMPERATURE: temperature})
 
+    @property
+    def with_any_bias(self) -> 'Prior':
+        """The prior of the same block whose sensor has jumped."""
+        if 'stretch_bias' not in self.free:
+            return self
+        place, covariance, spread = (
+            self.free.index('stretch_bias'), self.covariance.copy(), self.spread.copy())
+        covariance[place, place], spread[place] = _JUMPED ** 2, _JUMPED
+        return replace(self, covariance=covariance, spread=spread)
+
     def informed(self, known: Known) -> 'Prior':
         """
         Return the prior of a block that was identified; other quantities keep theirs.
