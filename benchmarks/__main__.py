@@ -65,7 +65,7 @@ TABLES |= {
     'laboratory': ('laboratory.compare',), 'line': ('line.compare',),
     'rates': ('studies.rates',),
     'lockstep': ('studies.lockstep',),
-    'continuum': ('continuum.compare', 'continuum.little_damped'),
+    'continuum': ('continuum.compare', 'continuum.little_damped', 'continuum.glued'),
     'compressible': ('compressible.compare',), 'predictions': ('continuum.predicted',),
     'waves': ('continuum.waves',), 'continuum-feedback': ('continuum.followed',),
     'repeats': ('repeats.compare',), 'beam': ('beam.compare', 'beam.sequences'),

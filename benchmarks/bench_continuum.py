@@ -47,12 +47,14 @@ SHAPES = {0.1: (6, 6, 2), 0.3: (6, 6, 3), 0.5: (5, 5, 4), 0.707: (5, 5, 4), 1.0:
           2.0: (4, 4, 7), 4.0: (3, 3, 10)}
 _MORE_SHAPES = dict(sorted({0.05: (7, 7, 1), 0.2: (6, 6, 2), **SHAPES}.items()))
 TARGETS = (0.9, 1.1, 1.2)
+# H/L of glued blocks: elements have twice the height.
+_GLUED = (0.25, 0.5, 1.0, 2.0)
 # Damping ratios of the paper's model about rest.
-_RATIO, _LITTLE = 0.08, 0.02
+_RATIO, _LITTLE, _GLUED_RATIO = 0.08, 0.02, 0.05
 J_LIM = 5.0
-# Limits of what modal may leave at its default order and at order 3, and of the relative error of
-# a prediction.
-_MOST, _MOST_3, _APART = 3.0, 1.0, 0.2
+# Limits of what modal may leave at its default order and at order 3, also of a glued block, and of
+# the relative error of a prediction.
+_MOST, _MOST_3, _MOST_GLUED, _APART = 3.0, 1.0, 1.2, 0.2
 
 
 def compare(*, quick: bool) -> Sheet:
@@ -96,12 +98,36 @@ def little_damped(*, quick: bool) -> Sheet:
         worst <= _MOST_3)
 
 
+def glued(*, quick: bool) -> Sheet:
+    """Return what commands leave of blocks that are glued with a face."""
+    rows, figures, worst = [], [], 0.0
+    names = 'first', 'modal', 'modal 3'
+    for shape in [1.0] if quick else _GLUED:
+        found = [
+            dict(_left(shape, target, _GLUED_RATIO, names, 'glued'))
+            for target in (TARGETS[1:2] if quick else TARGETS)]
+        figures.append({'shape': shape, 'targets': found})
+        worst = max(worst, *(x['modal 3'] for x in found))
+        rows.append([f'{shape:g}', ', '.join(f'{x["first"]:.1f}' for x in found), *(
+            ', '.join(f'{x[name]:.1f} ({x[f"{name} time"]:.2f})' for x in found)
+            for name in names[1:])])
+    return Sheet(
+        'continuum_glued', 'Blocks that are glued with a face, damping ratio '
+        f'{_GLUED_RATIO:g}, to 0.9, 1.1 and 1.2',
+        ('H/L', '`two_step`, first mode', '`modal` (time)', '`modal`, order 3 (time)'), rows,
+        {'rows': figures}, worst <= _MOST_GLUED)
+
+
 def _left(
         shape: float, target: float, damping_ratio: float = _RATIO,
-        names: Sequence[str] = ('step', 'paper', 'first', 'modal', 'modal 3')
-) -> Iterator[tuple[str, float]]:
-    """Yield names and vibrations in % of the step, and times in units of that of the paper."""
-    paper, block = blocks(shape, damping_ratio)
+        names: Sequence[str] = ('step', 'paper', 'first', 'modal', 'modal 3'),
+        mount: str = 'free') -> Iterator[tuple[str, float]]:
+    """
+    Yield names and vibrations in % of the step, and times in units of a two-step command.
+
+    It is that of the paper's model for a free block, and that of the first mode for a glued one.
+    """
+    paper, block = blocks(shape, damping_ratio, mount)
     unit = paper.block.time_unit
     period = block.block.period / unit
     first = {}
@@ -119,18 +145,30 @@ def _left(
             yield 'predicted', 0.0 if left is None else 100.0 * left.vibration
         move = _slowed(move, actuator.block.time_unit / unit)
         first[name] = move
-        yield name, _vibration(shape, paper, move, period, target)
+        yield name, _vibration(elements_of(shape, paper, mount), move, period, target)
     for name in names[-2:]:
-        yield f'{name} time', first[name].duration / first['paper'].duration
+        yield f'{name} time', first[name].duration / first[
+            'paper' if mount == 'free' else 'first'].duration
 
 
-def blocks(shape: float, damping_ratio: float = _RATIO) -> tuple[Actuator, Actuator]:
-    """Return a block of some H/L as the paper has it, and with all modes of a free one."""
+def blocks(
+        shape: float, damping_ratio: float = _RATIO, mount: str = 'free'
+) -> tuple[Actuator, Actuator]:
+    """Return a block of some H/L as the paper has it, and with all modes as it is mounted."""
     with unquestioned():  # of flat blocks
         paper = Actuator(
             half_thickness=0.01 * shape, damping_ratio=damping_ratio, chain_limit=J_LIM)
         # The same coefficient: as from a data sheet, not from the ringing.
-        return paper, paper.replace(mount='free')
+        return paper, paper.replace(mount=mount)
+
+
+def elements_of(shape: float, paper: Actuator, mount: str = 'free') -> Block:
+    """Return the elements of a block of some H/L."""
+    material = paper.model.material
+    height = 2.0 * shape if mount == 'glued' else shape
+    return Block(
+        height, J_LIM, material.zeta * material.c1 / 6.0, _MORE_SHAPES[height],
+        glued=mount == 'glued')
 
 
 def _slowed(move: Move, factor: float) -> Move:
@@ -139,10 +177,8 @@ def _slowed(move: Move, factor: float) -> Move:
         levels=tuple(x._replace(time=x.time * factor) for x in move.levels))
 
 
-def _vibration(shape: float, paper: Actuator, move: Move, period: float, target: float) -> float:
+def _vibration(elements: Block, move: Move, period: float, target: float) -> float:
     """Return the peak to peak of the mean stretch in a period after the arrival, in %."""
-    material = paper.model.material
-    elements = Block(shape, J_LIM, material.zeta * material.c1 / 6.0, _MORE_SHAPES[shape])
     arrival = move.duration if math.isfinite(move.duration) else 0.5 * period
     ends = [*(x.time for x in move.levels[1:]), arrival + period]
     times, stretch = elements.follow([
@@ -176,7 +212,7 @@ def predicted(*, quick: bool) -> Sheet:
             left = remaining(request, move)
             told = 0.0 if left is None else 100.0 * left.vibration
             seen = _vibration(
-                shape, paper, _slowed(move, block.block.time_unit / unit),
+                elements_of(shape, paper), _slowed(move, block.block.time_unit / unit),
                 block.block.period / unit, target)
             if max(told, seen) >= _NOTABLE:
                 worst = max(worst, told / max(seen, 1e-9), seen / max(told, 1e-9))
@@ -220,8 +256,7 @@ def waves(*, quick: bool) -> Sheet:
 def _amplitude(shape: float, paper: Actuator, actuator: Actuator, frequency: float) -> float:
     """Return the amplitude of the mean stretch in the middle of a wave that an actuator plans."""
     plan = actuator.wave('sine', frequency, _AMPLITUDE, cycles=_CYCLES)
-    material, unit = paper.model.material, paper.block.time_unit
-    elements = Block(shape, J_LIM, material.zeta * material.c1 / 6.0, _MORE_SHAPES[shape])
+    unit, elements = paper.block.time_unit, elements_of(shape, paper)
     loads = paper.model.units.of_level(plan.flux_densities[:-1])
     times, stretch = elements.follow([*zip(
         (np.diff(plan.times) / unit).tolist(), loads.tolist(), strict=True)])
@@ -244,9 +279,7 @@ class _Elements(Plant):
     """A block on finite elements as a plant."""
 
     def __init__(self, shape: float, paper: Actuator, _: Bench, time: int) -> None:
-        material = paper.model.material
-        self._elements = Block(
-            shape, J_LIM, material.zeta * material.c1 / 6.0, _MORE_SHAPES[shape])
+        self._elements = elements_of(shape, paper)
         self._units, self.time, self._level, self._stretch = paper.model.units, time, 0.0, 1.0
         self.applied, self._levels = [], []
 
@@ -304,13 +337,12 @@ _OWN = 30
 def recorded(shape: float) -> tuple[Actuator, Measurement]:
     """Return the paper's model of a block, and samples of its finite elements without noise."""
     paper, _ = blocks(shape)
-    block, material = paper.block, paper.model.material
+    block = paper.block
     dwell, count = _DWELL * block.period, int(_DURATION / (_DWELL * block.period))
     times = np.append(0.0, 2.0 * block.period + dwell * np.arange(count))
-    loads = np.append(0.0, elastic_force(np.resize(_STEPS, count), material))
+    loads = np.append(0.0, elastic_force(np.resize(_STEPS, count), paper.model.material))
     unit = block.time_unit
-    elements = Block(shape, J_LIM, material.zeta * material.c1 / 6.0, SHAPES[shape])
-    moved, stretch = elements.follow([*zip(
+    moved, stretch = elements_of(shape, paper).follow([*zip(
         np.diff(np.append(times, _DURATION)) / unit, loads.tolist(), strict=True)])
     samples = np.arange(int(_DURATION * _RATE)) / _RATE
     return paper, Measurement(

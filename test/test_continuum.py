@@ -59,6 +59,15 @@ def test_slender_block_is_a_bar():
     assert found.shares[first] == pytest.approx(8.0 / math.pi ** 2, rel=0.01)
 
 
+@pytest.mark.parametrize(('shape', 'stretch', 'ratio'), [
+    (0.4, 0.9, 1.003), (0.4, 1.2, 1.006), (1.0, 0.9, 1.088), (1.0, 1.2, 0.904), (1.5, 1.2, 0.890)])
+def test_frequency_of_a_glued_block_follows_its_stretch(shape, stretch, ratio):
+    """The ratios are those of finite elements at rest under a load (`block_elements`)."""
+    with unquestioned():
+        model = Actuator(half_thickness=0.01 * shape, chain_limit=5.0, mount='glued').model
+    assert model.frequency(stretch) / model.frequency(1.0) == pytest.approx(ratio, rel=0.04)
+
+
 def test_glued_slender_block_is_a_bar_of_twice_the_length():
     free, glued = spectrum(6.0, 'free'), spectrum(6.0, 'glued')
     assert glued.frequencies[glued.first] == pytest.approx(

@@ -107,7 +107,7 @@ def spectrum(
     mount : {'free', 'glued'}
         Free, or with one face across the field glued to a rigid support.
     stretch : float
-        Uniform stretch about which the block vibrates; 1 for a glued one.
+        Stretch about which the block vibrates, taken as uniform; that of a glued one is not.
     j_lim : float
         Limiting extensibility of the Gent model; infinite for neo-Hookean.
     bulk_ratio : float
@@ -358,16 +358,13 @@ def mounted(
                      if ratios[i] <= _FASTEST and shares[i] >= _WEAKEST][:_COUNT])
 
     def about(stretch: float) -> tuple[Array, Array]:
-        there = spectrum(shape, 'free', stretch, j_lim, bulk_ratio)
+        there = spectrum(shape, mount, stretch, j_lim, bulk_ratio)
         return there.frequencies / there.frequencies[there.like(frequency)], there.shares
 
-    exponents = (
-        _exponents(about, ratios[strong], shares[strong]) if free
-        else ([0.0] * len(strong),) * 2)
     rows = [*zip(
         ratios[strong].tolist(), shares[strong].tolist(),
         (min(damping_ratio * x, _MOST_DAMPED) for x in ratios[strong].tolist()),
-        *exponents, strict=True)]
+        *_exponents(about, ratios[strong], shares[strong]), strict=True)]
     weak = np.delete(np.arange(len(ratios)), strong)
     left = 1.0 - float(found.shares[first] + np.sum(shares[strong]))
     if left >= _WEAKEST:
@@ -375,8 +372,8 @@ def mounted(
         ratio = float(np.sum(shares[weak]) / np.sum(shares[weak] / ratios[weak]))
         rows.append((ratio, left, BROAD, 0.0, 0.0))
     return Mounted(
-        stiffness, float(factor), *(
-            _transverse(shape, j_lim, bulk_ratio, frequency, factor) if free else (1.0, 0.0)),
+        stiffness, float(factor),
+        *_transverse(shape, mount, j_lim, bulk_ratio, frequency, factor / stiffness),
         Modes.of_numbers(rows))
 
 
@@ -443,7 +440,7 @@ def _odds(shares: Array) -> Array:
 
 
 def _transverse(
-        shape: float, j_lim: float, bulk_ratio: float, first: float,
+        shape: float, mount: str, j_lim: float, bulk_ratio: float, first: float,
         factor: float) -> tuple[float, float]:
     """
     Return the transverse factor and exponent that fit the first mode about several stretches best.
@@ -458,7 +455,7 @@ def _transverse(
         None, j_lim, bulk_ratio))
     wanted, lateral = [], []
     for stretch in _STRETCHES:
-        found = spectrum(shape, 'free', stretch, j_lim, bulk_ratio)
+        found = spectrum(shape, mount, stretch, j_lim, bulk_ratio)
         stiffness = float(law.elastic_stiffness(stretch, material))
         lateral.append(stretch ** -3 if math.isinf(bulk_ratio)
                        else 6.0 * float(law.mass(stretch, material)) - c1)
