@@ -31,6 +31,9 @@ from hmsa.runs.record import ROUNDED, Run, setpoints_of
 # share, up to the latest. Until 2.25, a cube with a damping ratio of 0.03 keeps 1.4 % even if all
 # derivatives are exact.
 _PARTS, _END, _BEYOND, _COUNTS, _LATEST = 4, 1.5, 0.25, 0.03, 2.5
+# Vibration that the model does not explain (RMS, in units of the step) from which moves end at the
+# latest: where shares differ between targets, no mode is found that fits all of them.
+_UNEXPLAINED = 0.01
 # Maximum change of a level, its expected standard deviation, and increment for derivatives, all
 # relative to the range of the levels.
 _LARGEST, _EXPECTED, _CHANGE = 0.3, 0.05, 1e-4
@@ -308,6 +311,12 @@ class _ModelUpdate:
             self._add_mode()
 
     @property
+    def unexplained(self) -> float:
+        """RMS of the vibration that the model does not explain, in units of the smallest step."""
+        left = self._left(self.found)
+        return math.sqrt(float(left @ left) / len(left)) / min(map(abs, self._sequence.steps))
+
+    @property
     def frequencies(self) -> list[float]:
         """Frequencies of all modes about rest in rad/s."""
         found = self.found
@@ -453,13 +462,14 @@ def _further_derivatives(
     return np.concatenate(added)
 
 
-def _ends(actuator: ActuatorParameters, found: ActuatorParameters) -> float:
+def _ends(actuator: ActuatorParameters, update: _ModelUpdate) -> float:
     """Return the end of moves in durations of those planned, with modes as they are found."""
-    modes = found.modes
+    modes = update.found.modes
     halves = [1.0 / x for x, share in zip(modes.ratios, modes.shares, strict=True)
               if abs(share) >= _COUNTS]
-    end = min(_END + _BEYOND + sum(halves), _LATEST) if halves else _END
-    return end * max(found.period / actuator.period, 1.0)
+    end = _LATEST if update.unexplained > _UNEXPLAINED else (
+        min(_END + _BEYOND + sum(halves), _LATEST) if halves else _END)
+    return end * max(update.found.period / actuator.period, 1.0)
 
 
 def _noise(trial: SequenceRepeat) -> float:
@@ -476,10 +486,10 @@ def learn(
 
     Parameters
     ----------
-    trials : sequence of Trial
+    trials : sequence of SequenceRepeat
         Repeats in order: the first with the planned levels, each further one with the levels that
         this function returned for the previous ones.
-    targets : sequence of Target
+    targets : sequence of TargetWindow
         At least one target.
     actuator : ActuatorParameters
         The actuator used for planning.
@@ -505,7 +515,7 @@ def learn(
     for x in trials:
         sequence.windows(x.time)
     update = _ModelUpdate(sequence, trials[:1], _noise(trials[0]))
-    sequence = _Sequence(trials[0], targets, actuator, _ends(actuator, update.found))
+    sequence = _Sequence(trials[0], targets, actuator, _ends(actuator, update))
     residuals = [sequence.residual(x.time, x.stretch) for x in trials]
     best = int(np.argmin([float(x @ x) for x in residuals]))
     trial, residual = trials[best], residuals[best]
@@ -556,7 +566,7 @@ def learn_from(runs: Sequence[Run]) -> tuple[Learnt, list[TargetWindow]]:
 
     Returns
     -------
-    (Learnt, list of Target)
+    (Learnt, list of TargetWindow)
         The next levels, and the setpoints, in s from the first level.
 
     Raises
