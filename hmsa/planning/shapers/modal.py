@@ -230,15 +230,16 @@ def weak_vibration(request: MoveRequest, move: Move) -> tuple[float, int]:
         2.0 * request.frequency)
     fastest = max((1.0, *(
         modes.ratios[i] * target ** modes.numbers[i][3] for i in modes.ringing)))
-    times, loads = np.array([(x.time, x.load) for x in move.levels]).T
-    changes = np.diff(loads, prepend=request.load) / float(law.elastic_stiffness(target, packed))
-    sizes = [0.0] * len(modes.ratios)
+    since = move.duration - np.array([x.time for x in move.levels])
+    loads = np.array([request.load, *(x.load for x in move.levels)])
+    changes = (loads[1:] - loads[:-1]) / float(law.elastic_stiffness(target, packed))
+    shares, sizes = modes.at(target)[1:], [0.0] * len(modes.ratios)
     for i in set(range(len(sizes))) - set(modes.ringing):
         band = _band(fastest, modes.ratios[i])
         ratios = np.minimum(damping * band, BROAD)
         rates = request.frequency * band * (1j * np.sqrt(1.0 - ratios ** 2) - ratios)
-        left = np.exp(np.outer(rates, move.duration - times)) @ changes
-        sizes[i] = 2.0 * abs(modes.at(target)[1 + i]) * float(np.sqrt(np.mean(np.abs(left) ** 2)))
+        left = np.exp(rates[:, None] * since) @ changes
+        sizes[i] = 2.0 * abs(shares[i]) * math.sqrt(float(np.vdot(left, left).real) / _BAND)
     return math.hypot(*sizes), int(np.argmax(sizes))
 
 
