@@ -9,7 +9,7 @@ What remains is the vibration of the mean stretch in the first period of the fir
 arrival, peak to peak, in % of the step.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 import math
@@ -52,6 +52,9 @@ _GLUED = (0.25, 0.5, 1.0, 2.0)
 # Damping ratios of the paper's model about rest.
 _RATIO, _LITTLE, _GLUED_RATIO = 0.08, 0.02, 0.05
 J_LIM = 5.0
+# Two-step command whose move time is the unit, by mount, and columns of tables.
+_BASES = {'free': 'paper', 'glued': 'first'}
+_WITH_MODES = '`modal` (time)', '`modal`, order 3 (time)'
 # Limits of what modal may leave at its default order and at order 3, also of a glued block, and of
 # the relative error of a prediction.
 _MOST, _MOST_3, _MOST_GLUED, _APART = 3.0, 1.0, 1.2, 0.2
@@ -75,61 +78,54 @@ def compare(*, quick: bool) -> Sheet:
     return Sheet(
         'continuum', f'Vibration in % of the step on finite elements, damping ratio {_RATIO:g}',
         ('H/L', 'step', "`two_step`, paper's model", '`two_step`, first mode', 'predicted',
-         '`modal` (time)', '`modal`, order 3 (time)'),
+         *_WITH_MODES),
         rows, {'rows': figures}, worst <= _MOST and apart <= _APART and all(
             x['modal 3'] <= _MOST_3 for x in figures))
 
 
 def little_damped(*, quick: bool) -> Sheet:
     """Return what modal leaves at little damping, where weak modes fade slowly."""
-    rows, figures, worst = [], [], 0.0
-    for shape in [1.0] if quick else [*_MORE_SHAPES]:
-        found = [
-            dict(_left(shape, target, _LITTLE, ('paper', 'modal', 'modal 3')))
-            for target in (TARGETS[1:2] if quick else TARGETS)]
-        figures.append({'shape': shape, 'targets': found})
-        worst = max(worst, *(x['modal 3'] for x in found))
-        rows.append([f'{shape:g}', *(
-            ', '.join(f'{x[name]:.1f} ({x[f"{name} time"]:.2f})' for x in found)
-            for name in ('modal', 'modal 3'))])
+    rows, figures, worst = _by_shape(_MORE_SHAPES, _LITTLE, 'free', quick=quick)
     return Sheet(
         'continuum_little', f'The same at a damping ratio of {_LITTLE:g}, to 0.9, 1.1 and 1.2',
-        ('H/L', '`modal` (time)', '`modal`, order 3 (time)'), rows, {'rows': figures},
+        ('H/L', "`two_step`, paper's model", *_WITH_MODES), rows, {'rows': figures},
         worst <= _MOST_3)
 
 
 def glued(*, quick: bool) -> Sheet:
     """Return what commands leave of blocks that are glued with a face."""
-    rows, figures, worst = [], [], 0.0
-    names = 'first', 'modal', 'modal 3'
-    for shape in [1.0] if quick else _GLUED:
-        found = [
-            dict(_left(shape, target, _GLUED_RATIO, names, 'glued'))
-            for target in (TARGETS[1:2] if quick else TARGETS)]
-        figures.append({'shape': shape, 'targets': found})
-        worst = max(worst, *(x['modal 3'] for x in found))
-        rows.append([f'{shape:g}', ', '.join(f'{x["first"]:.1f}' for x in found), *(
-            ', '.join(f'{x[name]:.1f} ({x[f"{name} time"]:.2f})' for x in found)
-            for name in names[1:])])
+    rows, figures, worst = _by_shape(_GLUED, _GLUED_RATIO, 'glued', quick=quick)
     return Sheet(
         'continuum_glued', 'Blocks that are glued with a face, damping ratio '
         f'{_GLUED_RATIO:g}, to 0.9, 1.1 and 1.2',
-        ('H/L', '`two_step`, first mode', '`modal` (time)', '`modal`, order 3 (time)'), rows,
-        {'rows': figures}, worst <= _MOST_GLUED)
+        ('H/L', '`two_step`, first mode', *_WITH_MODES), rows, {'rows': figures},
+        worst <= _MOST_GLUED)
+
+
+def _by_shape(
+        shapes: Iterable[float], damping_ratio: float, mount: str, *, quick: bool
+) -> tuple[list[list[str]], list[dict[str, Any]], float]:
+    """Return rows and figures of a two-step command and of modal, and the most at order 3."""
+    names, rows, figures, worst = (_BASES[mount], 'modal', 'modal 3'), [], [], 0.0
+    for shape in (1.0,) if quick else shapes:
+        found = [
+            dict(_left(shape, target, damping_ratio, names, mount))
+            for target in (TARGETS[1:2] if quick else TARGETS)]
+        figures.append({'shape': shape, 'targets': found})
+        worst = max(worst, *(x['modal 3'] for x in found))
+        rows.append([f'{shape:g}', ', '.join(f'{x[names[0]]:.1f}' for x in found), *(
+            ', '.join(f'{x[name]:.1f} ({x[f"{name} time"]:.2f})' for x in found)
+            for name in names[1:])])
+    return rows, figures, worst
 
 
 def _left(
         shape: float, target: float, damping_ratio: float = _RATIO,
         names: Sequence[str] = ('step', 'paper', 'first', 'modal', 'modal 3'),
         mount: str = 'free') -> Iterator[tuple[str, float]]:
-    """
-    Yield names and vibrations in % of the step, and times in units of a two-step command.
-
-    It is that of the paper's model for a free block, and that of the first mode for a glued one.
-    """
+    """Yield names and vibrations in % of the step, and times in units of that of `_BASES`."""
     paper, block = blocks(shape, damping_ratio, mount)
-    unit = paper.block.time_unit
-    period = block.block.period / unit
+    period = block.block.period / paper.block.time_unit
     first = {}
     for name, actuator, shaper, order in (
             ('step', paper, 'step', 2), ('paper', paper, 'two_step', 2),
@@ -143,12 +139,11 @@ def _left(
         if name == 'first':
             left = remaining(request, move)
             yield 'predicted', 0.0 if left is None else 100.0 * left.vibration
-        move = _slowed(move, actuator.block.time_unit / unit)
+        move = _scaled(move, actuator.block, paper.block)
         first[name] = move
         yield name, _vibration(elements_of(shape, paper, mount), move, period, target)
     for name in names[-2:]:
-        yield f'{name} time', first[name].duration / first[
-            'paper' if mount == 'free' else 'first'].duration
+        yield f'{name} time', first[name].duration / first[_BASES[mount]].duration
 
 
 def blocks(
@@ -171,10 +166,13 @@ def elements_of(shape: float, paper: Actuator, mount: str = 'free') -> Block:
         glued=mount == 'glued')
 
 
-def _slowed(move: Move, factor: float) -> Move:
+def _scaled(move: Move, block: ActuatorParameters, paper: ActuatorParameters) -> Move:
+    """Return a move of a block in the units of time and load of the paper's model."""
+    time = block.time_unit / paper.time_unit
+    load = block.flux_density_unit / paper.flux_density_unit
     return move._replace(
-        duration=move.duration * factor,
-        levels=tuple(x._replace(time=x.time * factor) for x in move.levels))
+        duration=move.duration * time,
+        levels=tuple(x._replace(time=x.time * time, load=x.load * load) for x in move.levels))
 
 
 def _vibration(elements: Block, move: Move, period: float, target: float) -> float:
@@ -201,7 +199,7 @@ def predicted(*, quick: bool) -> Sheet:
     shapers = _PREDICTED[:2] if quick else _PREDICTED
     for shape, target in _CASES[2:3] if quick else _CASES:
         paper, block = blocks(shape)
-        material, unit = block.model.material, paper.block.time_unit
+        material = block.model.material
         held = _PUSH * abs(float(elastic_force(target, material)))
         cells = []
         for name, periods in shapers:
@@ -212,8 +210,8 @@ def predicted(*, quick: bool) -> Sheet:
             left = remaining(request, move)
             told = 0.0 if left is None else 100.0 * left.vibration
             seen = _vibration(
-                elements_of(shape, paper), _slowed(move, block.block.time_unit / unit),
-                block.block.period / unit, target)
+                elements_of(shape, paper), _scaled(move, block.block, paper.block),
+                block.block.period / paper.block.time_unit, target)
             if max(told, seen) >= _NOTABLE:
                 worst = max(worst, told / max(seen, 1e-9), seen / max(told, 1e-9))
             figures.append({'shape': shape, 'target': target, 'shaper': name, 'periods': periods,
@@ -411,11 +409,9 @@ def _planned(shape: float, paper: Actuator, found: Identification, target: float
     """Return what a plan with identified values leaves, in % of the step."""
     block = found.actuator
     move = get_shaper('modal')(MoveRequest(State(1.0), target, block.nondimensional))
-    move = _slowed(move, block.time_unit / paper.block.time_unit)
-    factor = block.flux_density_unit / paper.block.flux_density_unit
-    move = move._replace(levels=tuple(
-        x._replace(load=factor * x.load) for x in move.levels))
-    return _vibration(shape, paper, move, block.period / paper.block.time_unit, target)
+    return _vibration(
+        elements_of(shape, paper), _scaled(move, block, paper.block),
+        block.period / paper.block.time_unit, target)
 
 
 def covered(*, quick: bool) -> Sheet:
