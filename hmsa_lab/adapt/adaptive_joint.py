@@ -317,7 +317,7 @@ class AdaptiveJoint:
             self.estimator.unmeasured = now - stamp > self.settings.temperature_max_age
             self.estimator.warmed(celsius - self._thermometer)
             self._thermometer = celsius
-        self.estimator.may_soften = (
+        self.estimator.modulus_may_jump = (
             self.trust.acts and self.estimator.since > self.trust.begin)
         before = self.estimator.screening.lost
         estimator, found = yield from doing(_updated, self.estimator, now)
@@ -569,22 +569,25 @@ class AdaptiveJoint:
         # A plan with changed parameters begins from an unknown state, so moves are not
         # interrupted.
         return not self.chosen and bool(self.planner.plan.segments) and (
-            latest.time < self.waits or self._softens(latest.time)
+            latest.time < self.waits or self._modulus_jumps(self._segment(latest.time))
             or latest.time >= self.next_choice and self.shown(latest.time))
 
     def shown(self, time: int) -> bool:
         """Return whether samples until a time show how the joint has arrived."""
-        plan = self.planner.plan
-        place = plan.under_way(self.planner.soonest(time))
-        return place >= 0 and (
-            time >= self.shown_from(plan.segments[place]) or self._softens(time))
+        segment = self._segment(time)
+        return segment is not None and (
+            time >= self.shown_from(segment) or self._modulus_jumps(segment))
 
-    def _softens(self, time: int) -> bool:
-        """Return whether the modulus has jumped since the setpoint under way at a time began."""
+    def _segment(self, time: int) -> PlannedSegment | None:
+        """Return the setpoint that a change of levels at a time would affect."""
         plan = self.planner.plan
         place = plan.under_way(self.planner.soonest(time))
-        return place >= 0 and plan.segments[place].path is None and (
-            self.estimator.softening > plan.segments[place].since)
+        return plan.segments[place] if place >= 0 else None
+
+    def _modulus_jumps(self, segment: PlannedSegment | None) -> bool:
+        """Return whether the modulus has jumped since a setpoint that is no path began."""
+        return segment is not None and segment.path is None and (
+            self.estimator.modulus_jump > segment.since)
 
     def shown_from(self, segment: PlannedSegment) -> int:
         """Return the time from which samples show how the joint has arrived at a setpoint."""

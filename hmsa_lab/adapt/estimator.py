@@ -33,7 +33,15 @@ from hmsa_lab.adapt.hypotheses import hypotheses
 from hmsa_lab.adapt.motion import follow, Levels, ModelMotion, rest
 from hmsa_lab.adapt.prior import Prior
 from hmsa_lab.adapt.screening import Screening
-from hmsa_lab.adapt.window import BiasCase, Rest, Simulation, SOFTER, Solution, Window
+from hmsa_lab.adapt.window import (
+    BiasCase,
+    Jump,
+    MODULUS_JUMPS,
+    Rest,
+    Simulation,
+    Solution,
+    Window,
+)
 
 # Initial noise, before it is estimated, and minimum noise.
 _FIRST_NOISE, _LEAST_NOISE = 1e-3, 2e-6
@@ -113,7 +121,6 @@ class StateEstimate:
     trouble: str  # reason if not; else empty
     jumped: float  # log odds that the sensor has changed since the last move began
     jump: int  # time in ns from which it has
-    softening: int  # time in ns of the last jump of the modulus
     changed: float  # relative log odds that the sensor is not as before; see `Solution`
     poor: bool  # whether the newest samples fit worse than their noise
 
@@ -182,7 +189,7 @@ class Estimator:
         self.learning = self.options.learn
         # Whether the modulus may jump: until a whole move has fitted, a mode that is missing looks
         # like that.
-        self.may_soften = False
+        self.modulus_may_jump = False
         self.unmeasured = True  # whether the temperature may change without a measurement
         self._levels: list[tuple[int, float]] = []
         self._origin = 0
@@ -207,7 +214,7 @@ class Estimator:
         self._fixed: Array | None = None
         self._warmed = 0.0  # change of the measured temperature in K since the window began
         self._refused: list[tuple[int, float]] = []  # samples that do not fit since others did
-        self.softening = 0  # time in ns of the last jump of the modulus
+        self.modulus_jump = 0  # time in ns of the last jump of the modulus
 
     @property
     def since(self) -> int:
@@ -277,17 +284,17 @@ class Estimator:
         window.settle(z, _AT_REST)
         here = self._take(window, levels, until)
         found = window.solve(z, levels, window.scatter(self.noise), until, here)
-        jumped = found is not None and window.first and found.jumped > _JUMPED
+        jumped = found is not None and window.first and found.sensor.odds > _JUMPED
         if found is not None and jumped and self._unchanged(
                 self._origin, self._origin + round(until * NANOSECONDS), 0.0):
             # What a sensor showed until it jumped does not count.
             self.restart(self.prior.with_any_bias, [
                 (self._origin + round(x * NANOSECONDS), y) for x, y in zip(
                     window.time.tolist(), window.stretch.tolist(), strict=True)
-                if x >= found.jump], settled=self._settled)
+                if x >= found.sensor.time], settled=self._settled)
             return self.update(time)
         if found is not None and window.first:
-            found = replace(found, jumped=-math.inf)
+            found = replace(found, sensor=Jump())
         elif found is not None:
             found, until = self._with_jump(window, found, levels, until)
             window = self._window
@@ -306,19 +313,19 @@ class Estimator:
     ) -> tuple[Solution | None, float]:
         """Return the solution after a jump of the modulus, if there was one, and its time in s."""
         trouble = self.screening.trouble
-        if not self.may_soften or self._fixed is not None or (
+        if not self.modulus_may_jump or self._fixed is not None or (
                 'repeats' in trouble or not len(window.time)):
-            return replace(found, softened=-math.inf), until
+            return replace(found, modulus=Jump()), until
         refused = self._refused if trouble else []
         if refused:
             wider = window.wider([(self._seconds(x), y) for x, y in refused])
-            odds, time = wider.softer(found.z, levels, wider.scatter(self.noise), until)
-            found = replace(found, softened=odds, softening=time)
-        if found.softened <= _JUMPED:
+            found = replace(found, modulus=wider.jump_of_modulus(
+                found.z, levels, wider.scatter(self.noise), until))
+        if found.modulus.odds <= _JUMPED:
             return found, until
         stamp = self._origin + round(until * NANOSECONDS)
         self._solution, self._refused = found, []
-        self.softening = self._origin + round(found.softening * NANOSECONDS)
+        self.modulus_jump = self._origin + round(found.modulus.time * NANOSECONDS)
         self.screening.restart()
         self._go_along(window, found, until)
         window = (self._window or window).wider([(self._seconds(x), y) for x, y in refused])
@@ -505,9 +512,8 @@ class Estimator:
         return StateEstimate(
             time, float(state[-2]), float(state[-1]), values, self.prior.free, deviations,
             covariance, off, found.instead, doubt, window.suspects.gain, self.noise,
-            not trouble, trouble, found.jumped,
-            self._origin + round(found.jump * NANOSECONDS), self.softening,
-            found.changed, found.poor)
+            not trouble, trouble, found.sensor.odds,
+            self._origin + round(found.sensor.time * NANOSECONDS), found.changed, found.poor)
 
     def _strange(self, z: Array) -> str:
         """Return a message on implausible parameters that samples would need; else empty."""
@@ -523,9 +529,9 @@ class Estimator:
         span = _LONGEST * here.values['time_unit']
         # A whole move is fitted at once, since early in one linearisation would be inaccurate.
         before = int(np.searchsorted(window.time, self._seconds(self._move_begins(until))))
-        softer = found.softened > _JUMPED
-        if softer:
-            place = min(int(np.searchsorted(window.time, found.softening)), count - 1)
+        jumps = found.modulus.odds > _JUMPED
+        if jumps:
+            place = min(int(np.searchsorted(window.time, found.modulus.time)), count - 1)
         elif before > 1:
             place = before - 1
         elif count > self.options.window or (
@@ -545,20 +551,20 @@ class Estimator:
         drift[-2:] = _AT_REST ** 2, (_AT_REST / here.values['time_unit']) ** 2
         if self._fixed is None:
             drift[:-2] = self._drift(time - window.begin)
-        if softer:
-            drift[self.prior.free.index('shear_modulus')] += SOFTER ** 2
+        if jumps:
+            drift[self.prior.free.index('shear_modulus')] += MODULUS_JUMPS ** 2
             # It has moved since a time between two samples.
-            since = max(found.softening, time) - float(window.time[max(place - 1, 0)])
+            since = max(found.modulus.time, time) - float(window.time[max(place - 1, 0)])
             unit = here.values['time_unit']
             drift[-2:] += np.square(
-                2.0 * SOFTER * since / unit * np.array([since / unit, 1.0 / unit]))
+                2.0 * MODULUS_JUMPS * since / unit * np.array([since / unit, 1.0 / unit]))
         follows = self._with_rest(here.values, time)
         wander, warming = follows @ np.diag(drift) @ follows.T, self._warming(follows)
         shift = round(time * NANOSECONDS)
         seconds = shift / NANOSECONDS
         # Later motion shows how equilibrium depends on parameters.
         at = window.rest if self.learning is (self._fixed is None) and self._unchanged(
-            self._origin, self._origin + shift, 0.0) and not (self._warmed or softer) else None
+            self._origin, self._origin + shift, 0.0) and not (self._warmed or jumps) else None
         noise = window.scatter(self.noise)
         moved = window.move_on(
             place, time, found.z, here, noise, wander, warming) if at is None else (

@@ -40,7 +40,7 @@ _WEAK_MODES = 0.05
 # logarithm.
 _JUMPS, _RARELY = np.array([0.05, 0.1]), 3.0
 #: Standard deviation of a jump of the modulus, as a logarithm: half of that before any sample.
-SOFTER = 0.075
+MODULUS_JUMPS = 0.075
 # Part of a change of the state up to which its effect on later motion is accurate (`motion`).
 _FADED = 1e-4
 # Maximum change per step of a coordinate that is a logarithm.
@@ -83,6 +83,13 @@ class BiasCase(NamedTuple):
     covariance: Array  # about the most probable ones, shape (q, q)
 
 
+class Jump(NamedTuple):
+    """How probable it is that quantities have jumped."""
+
+    odds: float = -math.inf  # log odds
+    time: float = 0.0  # in s from the origin of the window
+
+
 @dataclass(frozen=True, eq=False)
 class Solution:
     """The most probable motion."""
@@ -94,10 +101,8 @@ class Solution:
     # As `off` for plans, where other parameters represent an apparent gain of the sensor.
     instead: Array
     doubt: BiasCase
-    jumped: float = -math.inf  # log odds that the sensor jumped before or in the window
-    jump: float = 0.0  # when it did
-    softened: float = -math.inf  # log odds that the modulus jumped in the window
-    softening: float = 0.0  # when it did
+    sensor: Jump = Jump()  # of bias and gain of the sensor, before or in the window
+    modulus: Jump = Jump()  # of the modulus in the window
     # Log odds that the sensor is not as before, if it may not be, relative to the possible ones
     # against that.
     changed: float = -math.inf
@@ -156,12 +161,11 @@ class Window:
     weighed: int = 0  # number of samples when these were chosen
     others: Others = Others(1.0, *(np.zeros(()),) * 3)  # effect of other sets
     rest: Rest | None = None  # equilibrium at the begin
-    first: bool = True  # whether the prior contains no samples
+    # Whether the prior contains no samples, or what may have jumped already has.
+    first: bool = True
     # As in `Solution`, when the suspects were weighed.
-    jumped: float = -math.inf
-    jump: float = 0.0
-    softened: float = -math.inf
-    softening: float = 0.0
+    sensor: Jump = Jump()
+    modulus: Jump = Jump()
     changed: float = -math.inf
     before: SensorBefore | None = None  # of a sensor that may have changed
     known: tuple[int, ...] = field(init=False)  # suspects estimated in earlier windows
@@ -274,8 +278,8 @@ class Window:
             _SURELY * math.sqrt(0.5 * len(self.time))))
         return Solution(
             found.z, found.here, sure * inverse(found.matrix, found.loose) + square,
-            np.broadcast_to(off, z.shape), np.broadcast_to(instead, z.shape), doubt, self.jumped,
-            self.jump, self.softened, self.softening, self.changed, poor)
+            np.broadcast_to(off, z.shape), np.broadcast_to(instead, z.shape), doubt, self.sensor,
+            self.modulus, self.changed, poor)
 
     def _doubt(self, found: Optimum) -> BiasCase:
         """Return the expectation if a constant force and a gain may be in error, too."""
@@ -294,15 +298,14 @@ class Window:
             found.stretch = np.insert(self.stretch, place, stretch)
         return found
 
-    def softer(
-            self, z: Array, levels: Levels, noise: float, until: float) -> tuple[float, float]:
-        """Return the log odds at coordinates that the modulus has jumped, and when."""
+    def jump_of_modulus(self, z: Array, levels: Levels, noise: float, until: float) -> Jump:
+        """Return the jump of the modulus at coordinates."""
         here = self.simulate(z, levels, noise, until)
         if here is None:
-            return -math.inf, self.begin
+            return Jump()
         self._look_for_jumps(Optimum(
             z, here, *self._slopes(z, here, noise), np.ones(len(z), dtype=np.bool_)), noise)
-        return self.softened, self.softening
+        return self.modulus
 
     def _slopes(self, z: Array, here: Simulation, noise: float) -> tuple[Array, Array]:
         """Return second derivatives of the cost, and the negative first ones."""
@@ -318,23 +321,23 @@ class Window:
         rival is that all is as in earlier windows, or as their samples leave open. Before the
         first motion, a sensor may have jumped at a sample at rest.
         """
-        self.jumped, self.softened = -math.inf, -math.inf
+        self.sensor, self.modulus = Jump(), Jump()
         if len(self.time) <= self.first or self.first and (
                 self.rest is None or TEMPERATURE in self.free):
             return
         here = found.here
         rival = Evidence(
             self.suspects, found.z, found.matrix, found.gradient, *self._room(found.z))
+        none = rival.best()
         shown = self.stretch - here.residual - coordinate_of(here.values['law']).rest
-        self.jumped, self.jump = self._best_jump(found, rival, self._sums(
-            here, noise, np.column_stack([np.ones(len(shown)), shown])), _JUMPS)
-        self.jumped -= rival.best()
+        self.sensor = self._best_jump(found, rival, self._sums(
+            here, noise, np.column_stack([np.ones(len(shown)), shown])), _JUMPS, none)
         # A block that warms changes in the course of time, and weak modes look like a change.
         if not (self.first or self.modal or TEMPERATURE in self.free) and (
                 'shear_modulus' in self.free):
-            self.softened, self.softening = self._best_jump(
-                found, rival, self._sums_of_modulus(here, noise), np.array([SOFTER]))
-            self.softened -= rival.best() + max(self.jumped, 0.0)
+            self.modulus = self._best_jump(
+                found, rival, self._sums_of_modulus(here, noise), np.array([MODULUS_JUMPS]),
+                none + max(self.sensor.odds, 0.0))
 
     def _sums(self, here: Simulation, noise: float, jump: Array) -> tuple[Array, Array, Array]:
         """Return derivatives of the cost by m quantities that add to later readings."""
@@ -361,8 +364,8 @@ class Window:
 
     def _best_jump(
             self, found: Optimum, rival: Evidence, sums: tuple[Array, Array, Array],
-            sizes: Array) -> tuple[float, float]:
-        """Return the log probability of a jump of one or more quantities, and when it was."""
+            sizes: Array, none: float) -> Jump:
+        """Return the jump of one or more quantities, against the log probability of none."""
         across, square, pull = sums
         square = square + np.diag(sizes ** -2)
         # The time is the most probable one with the suspects of earlier windows.
@@ -386,7 +389,8 @@ class Window:
             for k, share in (
                 (0, 0.0), (best, math.log(np.mean(np.exp(gain - gain[best])))))[self.first:]
             for n in range(1, len(sizes) + 1))
-        return odds - _RARELY, float(self.time[place]) if place else self.begin
+        return Jump(
+            odds - _RARELY - none, float(self.time[place]) if place else self.begin)
 
     def _sensor_changed(self, found: Optimum) -> float:
         """
@@ -521,10 +525,9 @@ class Window:
         It begins at the next sample, or at the requested time. In between, coordinates change by
         the matrix ``warming``, and gain the covariance ``drift``, both of shape (q, q).
         """
-        by, weights = here.by[:count], here.weights[:count]
-        matrix = self.information + by.T @ (weights[:, None] * by) / noise ** 2
-        gradient = by.T @ (weights * here.residual[:count]) / noise ** 2
-        gradient = gradient + self.information @ (self.mean - z)
+        matrix, gradient = self._slopes(z, here._replace(
+            residual=here.residual[:count], by=here.by[:count], weights=here.weights[:count]),
+            noise)
         covariance = inverse(matrix, np.ones(len(z), dtype=np.bool_))
         change = warming @ transport(here.motion, count)
         there = np.append(z[:-2], [here.motion.stretch[count], here.motion.rate[count]])
