@@ -192,9 +192,7 @@ def _smooth(each: float, count: int, request: MoveRequest, weak: _Weak) -> Array
     frequencies have errors, and weak modes any frequency near their mean. Each further row changes
     one position or rate at the end, and as little else as possible. None if rounding prevents it.
     """
-    packed, target, modes = request.material.packed, request.target, request.material.modes
-    frequency = request.frequency
-    damping = float(law.damping(target, packed) / law.mass(target, packed)) / (2.0 * frequency)
+    target, modes, damping = request.target, request.material.modes, _damping_ratio(request)
     shares = modes.at(target)
     rings = [(1.0, damping, _ERROR * shares[0]), *(
         (ratio * target ** exponent, own, _ERROR * share * ratio * target ** exponent)
@@ -205,9 +203,16 @@ def _smooth(each: float, count: int, request: MoveRequest, weak: _Weak) -> Array
     others = np.stack([band, damping * band, np.full(_BAND, share / math.sqrt(_BAND))], axis=1)
     found = np.empty((1 + 2 * len(rings), count))
     solved = motion.smooth(
-        frequency * each, len(rings), np.concatenate([np.array(rings), others]),
+        request.frequency * each, len(rings), np.concatenate([np.array(rings), others]),
         _BENT[request.order > 2], found)
     return found if solved else None
+
+
+def _damping_ratio(request: MoveRequest) -> float:
+    """Return the damping ratio of the first mode about the target."""
+    packed, target = request.material.packed, request.target
+    return float(law.damping(target, packed) / law.mass(target, packed)) / (
+        2.0 * request.frequency)
 
 
 def _band(fastest: float, mean: float) -> Array:
@@ -225,14 +230,13 @@ def weak_vibration(request: MoveRequest, move: Move) -> tuple[float, int]:
     damping of a viscous material and keep more than it does. The vibration is from peak to peak,
     the root mean square over these frequencies, in linear motion about the target.
     """
-    packed, target, modes = request.material.packed, request.target, request.material.modes
-    damping = float(law.damping(target, packed) / law.mass(target, packed)) / (
-        2.0 * request.frequency)
+    target, modes, damping = request.target, request.material.modes, _damping_ratio(request)
     fastest = max((1.0, *(
         modes.ratios[i] * target ** modes.numbers[i][3] for i in modes.ringing)))
     since = move.duration - np.array([x.time for x in move.levels])
     loads = np.array([request.load, *(x.load for x in move.levels)])
-    changes = (loads[1:] - loads[:-1]) / float(law.elastic_stiffness(target, packed))
+    changes = (loads[1:] - loads[:-1]) / float(
+        law.elastic_stiffness(target, request.material.packed))
     shares, sizes = modes.at(target)[1:], [0.0] * len(modes.ratios)
     for i in set(range(len(sizes))) - set(modes.ringing):
         band = _band(fastest, modes.ratios[i])
