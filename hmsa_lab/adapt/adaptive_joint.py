@@ -640,8 +640,9 @@ class AdaptiveJoint:
             self.latest, self.prior.values, plan.level(now).flux_density, target,
             start, self.amplitude, use if self.adapts else '')
         return words + (
-            '; the sensor has changed, according to the samples, and plans keep '
-            f'{trust.parameters}: check the sensor, or ~/reset_estimate to take it as it is'
+            '; the sensor has changed, according to the samples, or a constant force or the coil, '
+            f'which look alike, and plans keep {trust.parameters}: check the sensor, or '
+            '~/reset_estimate to take it as it is'
             if self.sensor_changed else '')
 
     def figures(self) -> dict[str, object]:
