@@ -8,8 +8,10 @@ from types import SimpleNamespace
 from mcap.reader import make_reader
 import numpy as np
 import pytest
+from test_report import KNOWN, simulated, write
 
 from hmsa.ending import ENDING
+from hmsa.errors import HmsaError
 from hmsa.runs.bags import read_runs
 from hmsa.runs.record import without_repeats
 from hmsa_ros.cli.run import _carried_out
@@ -227,6 +229,30 @@ def test_a_simulated_experiment_never_commands_nodes_that_run_already(start, ros
     assert run.wait(RUN_SECONDS) == 1
     assert 'another planner, plant or driver is running' in run.stderr
     assert not asked
+
+
+@pytest.mark.parametrize(('error', 'status'), [
+    (KeyboardInterrupt, 130), (HmsaError('the planner ended early'), 1)])
+def test_the_repeats_that_have_ended_are_printed_after_an_interrupt_or_an_error(
+        handlers, command, monkeypatch, tmp_path, error, status):
+    left = [1, 2]
+
+    def conduct(experiment, *_):
+        if not left:
+            raise error
+        left.pop()
+        write(experiment.bag, simulated(), **KNOWN)
+        return SimpleNamespace(
+            measured=True, exits={}, notes=(), seconds={'start': 1.0, 'sequence': 1.0}, pace=1.0)
+
+    monkeypatch.setattr('hmsa_ros.clients.experiment.conduct', conduct)
+    line = 'run 1.1:10 1.2:10 1.4:10 --simulate --repeat 4 --json --out'
+    found, shown, said = command(line, tmp_path / 'out')
+    assert found == status
+    assert ('interrupted' if status == 130 else 'the planner ended early') in said
+    result = json.loads(shown)
+    assert [x['verdict'] for x in result['repeats']] == ['arrived', 'arrived']
+    assert [x['repeats'] for x in result['statistics']] == [2, 2, 2]
 
 
 def test_the_evaluation_of_a_run_can_be_interrupted(handlers, monkeypatch, tmp_path):

@@ -91,37 +91,52 @@ def run(arguments: argparse.Namespace) -> int:
     for x in folders:
         prepare(x)
     show_notes()
-    records, each, whole = [], [], True
-    for experiment in experiments:
-        try:
+    records: list[dict[str, Any]] = []
+    each: list[list[Finding]] = []
+    whole = True
+    try:
+        for experiment in experiments:
             with progress() as update:
                 done, parts, report = _carried_out(arguments, experiment, tolerances, update)
-        except KeyboardInterrupt:
-            so_far = f'; the bag so far: {experiment.bag}' if experiment.bag.exists() else ''
-            print(f'interrupted{so_far}', file=sys.stderr)
-            return ENDING.status
-        from hmsa.report.evaluation import level_results
+            from hmsa.report.evaluation import level_results
 
-        levels = [y for x in parts for y in level_results(x.run)] if experiment.levels else []
-        findings = [y for x in parts for y in x.evaluation.findings] if (
-            experiment.setpoints) else []
-        verdict, reason = _verdict(experiment, findings, done, parts)
-        each.append(findings)
-        # A recorder that lost messages ends with 1; a note names them.
-        whole = whole and not any(done.exits.values())
-        records.append({
-            'verdict': verdict, 'reason': reason, 'setpoints': [x.to_dict() for x in findings],
-            **({'levels': [asdict(x) for x in levels]} if experiment.levels else {}),
-            'notes': done.notes, 'exits': done.exits, 'bag': experiment.bag, 'report': report})
-        if not arguments.json:
-            _print(experiment, parts, levels, reason, done, report)
+            levels = [y for x in parts for y in level_results(x.run)] if experiment.levels else []
+            findings = [y for x in parts for y in x.evaluation.findings] if (
+                experiment.setpoints) else []
+            verdict, reason = _verdict(experiment, findings, done, parts)
+            each.append(findings)
+            # A recorder that lost messages ends with 1; a note names them.
+            whole = whole and not any(done.exits.values())
+            records.append({
+                'verdict': verdict, 'reason': reason,
+                'setpoints': [x.to_dict() for x in findings],
+                **({'levels': [asdict(x) for x in levels]} if experiment.levels else {}),
+                'notes': done.notes, 'exits': done.exits, 'bag': experiment.bag,
+                'report': report})
+            if not arguments.json:
+                _print(experiment, parts, levels, reason, done, report)
+    except KeyboardInterrupt:
+        so_far = f'; the bag so far: {experiment.bag}' if experiment.bag.exists() else ''
+        print(f'interrupted{so_far}', file=sys.stderr)
+        return ENDING.status
+    finally:
+        # Also of the repeats before an interrupt or an error.
+        if records:
+            _print_all(arguments, records, each)
+    return 0 if whole and all(x['verdict'] in ('arrived', NOT_MEASURED) for x in records) else 1
+
+
+def _print_all(
+        arguments: argparse.Namespace, records: list[dict[str, Any]],
+        each: 'list[list[Finding]]') -> None:
+    """Print the records as JSON, or the statistics of the repeats that have ended."""
     from hmsa.report.comparison import statistics, statistics_table
+
     if arguments.json:
         print(json_text(with_notes(records[0] if arguments.repeat == 1 else {
             'repeats': records, 'statistics': statistics(each)})))
     elif arguments.repeat > 1 and any(each):
         print(statistics_table({'': statistics(each)}))
-    return 0 if whole and all(x['verdict'] in ('arrived', NOT_MEASURED) for x in records) else 1
 
 
 def _carried_out(
