@@ -14,7 +14,7 @@ from hmsa.cli import main, terminal
 from hmsa.errors import HmsaError
 from hmsa.model.units import NANOSECONDS
 from hmsa_ros.clients.client import PlannerClient
-from hmsa_ros.clients.link import Link
+from hmsa_ros.clients.link import Link, Stopping
 from hmsa_ros.nodes.planner import PlannerNode
 
 # Far ahead for a busy machine.
@@ -146,6 +146,32 @@ def test_a_second_planner_is_not_taken_for_a_newer_request(ros_env, serve, start
                 'ended early: the planner in namespace / was restarted, or a second one answers '
                 r'\(no request yet\): expected one until the end')):
             client.follow(verdict, timeout=20.0)
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize(('restarted', 'words'), [
+    (True, r'the planner in namespace / was restarted, or a second one answers \(accepted'),
+    (False, 'the planner in namespace / has ended: if an actuator moves, switch its coil off')])
+def test_a_planner_that_ended_during_a_stop_is_named(start, restarted, words):
+    # The stop itself begins far ahead.
+    planner = ('planner', '--ros-args', '-p', 'lead_time:=60.0')
+    first = start.hmsa(*planner)
+    with Link() as link:
+        stopping = Stopping(link)
+
+        def told(what):
+            stopping.go_on()
+            return what()
+
+        link.spin_until(lambda: told(lambda: stopping.answered), 'an answer')
+        assert link.verdict.plan == 1
+        first.stop()
+        if restarted:
+            # Its first plan has the number of the stop.
+            start.hmsa(*planner)
+            assert start.hmsa('send', '1.2:30').wait() == 0
+        link.spin_until(lambda: told(lambda: stopping.failure), 'the end')
+        assert re.match(f'the stop was sent, but {words}', stopping.failure)
 
 
 @pytest.mark.slow

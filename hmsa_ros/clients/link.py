@@ -86,7 +86,8 @@ class Link(TemporaryNode):
 
     def instead_of(self, verdict: StatusVerdict) -> str:
         """Return what the planner carries out instead of the plan of a verdict, in words."""
-        if self.verdict.plan < verdict.plan:  # which it counts
+        # It counts plans, and knows the recent requests by name.
+        if self.verdict.plan <= verdict.plan:
             return (
                 f'{self.planner} was restarted, or a second one answers ({self.verdict.message}): '
                 'expected one until the end')
@@ -205,8 +206,12 @@ class Stopping:
             self.failure = verdict.message + (
                 '' if verdict.code in _KNOWN else
                 '; plant or driver has not acknowledged the stop: switch the coil off there')
-        elif link.verdict.plan != verdict.plan:
+        elif link.verdict.plan != verdict.plan or link.verdict.on(self._name) is None:
             self.failure = f'the stop was sent, but {link.instead_of(verdict)}'
+        elif not link.listened:
+            self.failure = (
+                f'the stop was sent, but {link.planner} has ended: if an actuator moves, switch '
+                'its coil off')
         elif passed > _STOP_SECONDS:
             self.failure = (
                 f'the planner has not come to rest ({link.verdict.state}: {verdict.message}): '
