@@ -207,6 +207,8 @@ def test_a_planner_drops_its_plan_refuses_and_waits_to_be_asked(reaction, monkey
         'close the interlock (hmsa interlock close), then send a new request')
     assert rig.runtime.request(Stop()).code != 'interlock'
     rig.run(rig.now + 1000 * MS)
+    assert rig.status.verdict.message == (
+        'stopped: the coil of a is off; no samples show whether it rests')
     rig.door = False
     rig.run(rig.now + 3000 * MS)
     assert not rig.cut

@@ -146,11 +146,14 @@ class Stops:
                 return Verdict(
                     Severity.WARN, Code.VIBRATING, 'the stop was acknowledged, but '
                     f'{self._watch.findings[joint].message}', self._name)
-        off = sorted(self._devices.cut | self._devices.open)
-        how = f'; the coil of {", ".join(off)} is off' if off else (
-            ', measured' if all(shown.values())
-            else ', acknowledged by plant or driver')
-        return Verdict(Severity.OK, Code.STOPPED, f'stopped: at rest{how}', self._name)
+        measured = all(shown.values())
+        if off := sorted(self._devices.cut | self._devices.open):
+            # Released, an actuator swings: that its coil is off says nothing of rest.
+            how = f'the coil of {", ".join(off)} is off; ' + (
+                'at rest, measured' if measured else 'no samples show whether it rests')
+        else:
+            how = 'at rest, ' + ('measured' if measured else 'acknowledged by plant or driver')
+        return Verdict(Severity.OK, Code.STOPPED, f'stopped: {how}', self._name)
 
     def _missing(self, now: int, steady: int) -> str:
         """Return what is known of joints that have not acknowledged, in a sentence."""
