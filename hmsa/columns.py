@@ -190,6 +190,10 @@ def read_table(
         raise BadInputError(f'{path} has zero bytes in its header: expected {kind} in UTF-8')
     separator = separator or next((x for x in _SEPARATORS if x in head), None)
     cells = _split(head, separator)
+    if separator is None and any(x[0] in '[(' for x in cells):
+        raise BadInputError(
+            f'{path} has spaces between its columns and before units ({excerpt(head)}): expected '
+            'commas, semicolons or tabs between the columns')
     if all(_number(x, separator) is not None for x in cells):
         raise BadInputError(
             f'{path} begins with numbers ({excerpt(head)}): expected a header with the columns '

@@ -137,6 +137,7 @@ def test_any_file_is_columns_of_numbers_or_one_sentence(tmp_path_factory, rows, 
     ('time,stretch [%]\n0,20\n', 'divide percent by 100'),
     ('time,strain [%]\n0,20\n', 'stretch is strain in percent over 100 plus 1'),
     ('time,displacement [mm]\n0,2\n', 'is the change of length over the length at rest, plus 1'),
+    ('time [ms] flux_density\n0 1\n', 'spaces between its columns .*: expected commas'),
     ('sep=;\n', 'is empty')])
 def test_another_unit_is_refused_with_what_to_do(csv, text, message):
     wanted = WANTED if 'flux' in text else ('time', 'stretch')
