@@ -167,7 +167,13 @@ def _tidy(where: str, columns: Columns) -> tuple[Columns, list[str], int]:
             'The timestamps of the samples jump back: the samples are sorted by timestamp. Was '
             'the clock reset in the run?')
     # Of samples with equal timestamps use the first, so that time increases.
-    columns = _rows(columns, np.unique(columns['time'], return_index=True)[1])
+    _, first, places = np.unique(columns['time'], return_index=True, return_inverse=True)
+    same = int(np.count_nonzero(columns['stretch'] != columns['stretch'][first][places]))
+    if same:
+        notes.append(
+            f'{same} samples have the timestamp of an earlier one, and another value: left out. '
+            'Are the timestamps rounded, or of two runs?')
+    columns = _rows(columns, first)
     stamps, stretch, rate = columns['time'], columns['stretch'], columns['rate']
     missing = ~(np.abs(rate) < _LARGEST_RATE)
     if np.any(missing):
@@ -177,7 +183,7 @@ def _tidy(where: str, columns: Columns) -> tuple[Columns, list[str], int]:
         slope = np.gradient(stretch, (stamps - stamps[0]) / NANOSECONDS) \
             if len(stamps) > 1 else np.zeros_like(stretch)
         columns['rate'] = np.where(missing, slope, rate)
-    return columns, notes, far + odd
+    return columns, notes, far + odd + same
 
 
 def read_runs(
