@@ -60,6 +60,16 @@ def test_a_command_that_nobody_applied_is_said_though_the_motion_fits():
     assert found.largest_difference < 1e-12
 
 
+@pytest.mark.parametrize('text', [
+    '/**:\n  ros__parameters:\n    actuator.density: 1.0\n    actuator.density: 2.0\n',
+    2 * '/**:\n  ros__parameters:\n    actuator.density: 1.0\n'])
+def test_a_parameter_file_with_a_key_twice_is_refused(tmp_path, text):
+    file = tmp_path / 'twice.yaml'
+    file.write_text(text)
+    with pytest.raises(BadInputError, match='begins a mapping with several .*each key once'):
+        read_parameter_file(file)
+
+
 def test_samples_of_a_clock_that_was_set_back_are_no_run_to_compare():
     run = moved()
     # The second half repeats times of the first.

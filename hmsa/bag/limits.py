@@ -5,12 +5,13 @@ Bags can come from untrusted sources. Their sizes and counts are checked against
 before memory is allocated, and YAML is checked before it is loaded.
 """
 
+from collections import Counter
 import json
 import math
 import reprlib
 from typing import Any
 
-from hmsa.errors import BagError
+from hmsa.errors import BagError, excerpt
 
 MEBIBYTE = 2**20
 #: Largest content of a chunk, and largest message; readers can be given another limit.
@@ -54,7 +55,12 @@ def load_json(text: str) -> Any:
 
 
 def load_yaml(text: str) -> Any:
-    """Return the content of a YAML text; raise `BagError` if invalid, too large, or aliased."""
+    """
+    Return the content of a YAML text.
+
+    Raise `BagError` if it is invalid, too large or aliased, or gives a key twice, of which a
+    parser would take the last and ROS 2 both.
+    """
     import yaml  # slow to import
 
     # The C parser is some ten times faster; not every installation of PyYAML has it.
@@ -77,7 +83,17 @@ def load_yaml(text: str) -> Any:
                     raise BagError(f'it is nested deeper than {YAML_DEPTH}')
             elif isinstance(event, yaml.CollectionEndEvent):
                 depth -= 1
-        return yaml.load(text, loader)
+
+        class Unique(loader):  # type: ignore[misc]
+            def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+                keys = Counter(x.value for x, _ in node.value if isinstance(x, yaml.ScalarNode))
+                if twice := [x for x, count in keys.items() if count > 1]:
+                    raise BagError(
+                        f'line {node.start_mark.line + 1} begins a mapping with several '
+                        f'{excerpt(twice[0])}, expected each key once')
+                return super().construct_mapping(node, deep)
+
+        return yaml.load(text, Unique)
     except BagError:
         raise
     except Exception as error:  # values that do not fit their tags raise errors of any class
