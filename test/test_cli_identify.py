@@ -178,6 +178,7 @@ def test_levels_sampled_beside_the_stretch_serve_with_semicolons_and_units(folde
     ('time,stretch\n' + 2 * ''.join(f'{x / 10},1\n' for x in range(12)),
      'line 14 jumps back in time from 1.1 to 0 s.*clock was set.*sort'),
     ('time,stretch\n0,1\n0,1\n0,1\n0.1,1\n', '2 of 4 rows .* different timestamp'),
+    ('time,stretch\n0,1\n0.1,\n0.2,\n0.3,1\n', r'2 of 4 rows .*\(2 without a number, 0 with'),
     ('time,stretch\n0,1\n1e-3,1.001\n2e-3,0.999\n', 'has 3 samples: expected 12 or more')])
 def test_bad_samples_end_with_2_and_a_sentence(folder, capsys, text, message):
     (folder / 'camera.csv').write_text(text, encoding='utf-8')

@@ -913,6 +913,22 @@ def test_a_clock_that_jumps_back_is_told(part_of):
     assert any('jump back' in x for x in part.run.notes)
 
 
+def test_samples_with_the_timestamp_of_another_are_told(part_of):
+    # Rounded to 1 ms.
+    rounded = [(time, topic, kind, replace(x, header=header(time // 1_000_000 * 1_000_000))
+                if topic == '/joint_states' else x) for time, topic, kind, x in simulated()]
+    part = part_of(rounded)
+    assert len(part.run.time) < 0.2 * part.run.left_out
+    assert f'{part.run.left_out} samples have the timestamp of an' in ' '.join(part.run.notes)
+
+
+@pytest.mark.parametrize('ahead', [AHEAD, -AHEAD])
+def test_samples_and_levels_of_two_clocks_are_not_identified(part_of, ahead):
+    run = part_of(simulated()).run
+    with pytest.raises(BadInputError, match='expected timestamps of one clock'):
+        recording_of(replace(run, time=run.time + ahead))
+
+
 def test_a_run_without_commands_shows_the_response_alone(tmp_path):
     part = one(tmp_path / 'bag', [*without(simulated(), 'command'), NO_COMMAND])
     report = Page(page([part]))

@@ -351,6 +351,11 @@ def recording_of(
         raise BadInputError(
             f'{run.path} has no command that took effect: expected the levels of the field')
     zero = int(run.time[0])
+    begin, end = levels[0].stamp, levels[-1].stamp
+    if max(zero - end, begin - int(run.time[-1])) > _ANOTHER_CLOCK * NANOSECONDS:
+        raise BadInputError(
+            f'{run.path} has levels from {begin / NANOSECONDS:.9g} to {end / NANOSECONDS:.9g} s '
+            f'and samples from {zero / NANOSECONDS:.9g} s on: expected timestamps of one clock')
     stamps = np.array([(x.stamp - zero) / NANOSECONDS for x in levels])
     fields = np.array([x.flux_density for x in levels])
     if stamps[0] > 0.0:
@@ -477,8 +482,9 @@ def _kept(path: Path, table: CsvColumns, notes: list[str]) -> NDArray[np.int64]:
         notes.append(f'{double} rows with the timestamp of the row before were left out')
     if lost + double > _MOST_LEFT_OUT * len(time):
         raise BadInputError(
-            f'{path} has {lost + double} of {len(time)} rows without a number or with the '
-            'timestamp of the row before: expected a different timestamp for each sample')
+            f'{path} has {lost + double} of {len(time)} rows that cannot be used ({lost} without '
+            f'a number, {double} with the timestamp of the row before): expected at most '
+            f'{100.0 * _MOST_LEFT_OUT:g} %, and a different timestamp for each sample')
     steps = steps[steps > 0.0]
     if len(steps) and float(np.max(steps)) > _GAP * float(np.median(steps)):
         notes.append(
