@@ -369,6 +369,19 @@ def test_an_unusual_value_causes_the_warning_of_the_command(tmp_path, capsys, gi
     assert all(f'hmsa: warning: {x}\n' in said_there for x in words)
 
 
+@pytest.mark.parametrize(('section', 'line', 'said'), [
+    ('/**', 'actuator.remanence: 100.0', r'remanence 100 T is unusual .* did you mean mT'),
+    ('/**', 'flux_density_max: 100.0\n    actuator.density: 1900.0', 'flux max 100 T is unusual'),
+    ('plant', 'actuator.shear_modulus: 20000.0',
+     'its section plant alone sets actuator.shear_modulus: plans use the parameters of planner')])
+def test_a_file_of_unusual_values_or_of_another_node_is_used_with_a_warning(
+        tmp_path, section, line, said):
+    file = tmp_path / 'a.yaml'
+    file.write_text(f'{section}:\n  ros__parameters:\n    {line}\n')
+    with pytest.warns((hmsa.UnusualWarning, hmsa.AssumedWarning), match=said):
+        hmsa.Actuator.from_yaml(file)
+
+
 def test_usual_actuators_cause_no_warning_and_models_without_j_lim_none_about_it():
     # Warnings are errors in tests.
     hmsa.Actuator(chain_limit=math.inf)

@@ -32,12 +32,13 @@ from hmsa.files import write_text, yaml_text
 from hmsa.interfaces.actuator import parameters_of, planned_from
 from hmsa.interfaces.parameters import (
     ACTUATOR_FIELDS,
+    BLOCK,
     CREEP_TOLERANCE,
     FLUX_DENSITY_MAX,
     LAW_NAME,
     ZETA,
 )
-from hmsa.interfaces.topics import PLANNER
+from hmsa.interfaces.topics import PLANNER, PLANT
 from hmsa.model.delivery import IDEAL
 from hmsa.model.equations import Array, critical_zeta, elastic_force, equilibrium_stretch
 from hmsa.model.moves import Setpoint, State
@@ -201,10 +202,18 @@ class Actuator:
         path = file_of(path, 'the path of a YAML file')
         entries = entries_of(path)
         assume_one_joint(path, entries)
-        return cls.from_parameters(
-            {name.partition('.')[2]: value
-             for name, value in read_parameter_file(path, entries).items()
-             if name.startswith(f'{PLANNER}.')}, path)
+        values = {name.partition('.')[2]: value
+                  for name, value in read_parameter_file(path, entries).items()
+                  if name.startswith(f'{PLANNER}.')}
+        blocks = {x.name for x in BLOCK}
+        if alone := [x for node, x, _ in entries
+                     if node == PLANT and x in blocks and x not in values]:
+            assume(
+                f'{path}: its section {PLANT} alone sets {", ".join(alone)}: plans use the '
+                f'parameters of {PLANNER} or of all nodes (/**), or else the defaults')
+        made = cls.from_parameters(values, path)
+        warn(made)
+        return made
 
     @classmethod
     def beam(
