@@ -43,15 +43,14 @@ class Trust:
         self._failed = False  # whether an estimate that fitted has failed later
 
     def doubt(
-            self, why: str, now: int, *, used: bool = True, fitted: bool = False,
-            at_once: bool = False) -> bool:
+            self, why: str, now: int, *, used: bool, fitted: bool) -> bool:
         """
         Record that samples do not fit at a time in ns; return whether to restart.
 
         An estimate that earlier samples ``fitted`` has failed, or one that plans ``used``.
         """
         self._doubts += 1
-        persists = self._doubts >= _PERSISTENT or at_once
+        persists = self._doubts >= _PERSISTENT
         if persists or not self.ended:
             self.why = why
         # The first samples of a motion, which are few, may not fit yet.
