@@ -24,6 +24,9 @@ from hmsa.motion import derivatives, SPEED
 #: Relative tolerance of the integration: far below the noise of any sensor.
 RTOL = 1e-8
 _NOTHING: Array = np.empty(0)
+# Step of a difference by the delay of a switch, relative to its uncertainty: the motion is nearly
+# linear in it, and its rounding error, `RTOL`, a thousandth of the difference or less.
+_SHIFT = 1e-2
 # Parameters whose derivatives are central differences of the motion, and half their width in
 # coordinates; for moduli, in units of the shear modulus.
 _ASIDE, _WIDTH = ('transverse_mass_factor', 'bulk_ratio'), 1e-3
@@ -290,7 +293,24 @@ def respond(
         if by is None:
             return None
         jacobian[:, free.index(name)] = by
-    return Response(values, shown, rate, jacobian, raw[:, inner_count:])
+    switched = raw[:, inner_count:]
+    if switched.size and not math.isinf(recording.slew_limit):
+        # Both ends of a ramp move with its level, which the derivative by one begin leaves out.
+        _switch(switched, recording, shifts, lambda x: respond(
+            recording, values, (), rtol=rtol, shifts=x), shown)
+    return Response(values, shown, rate, jacobian, switched)
+
+
+def _switch(
+        switched: Array, recording: Measurement | UncheckedMeasurement, shifts: Array | None,
+        shifted: Callable[[Array], Response | None], shown: Array) -> None:
+    """Replace derivatives by delays of switches, shape (n, u), by differences."""
+    count, step = switched.shape[1], _SHIFT * recording.earlier
+    base = np.full(count, -0.5 * recording.earlier) if shifts is None else shifts
+    for j in range(count):
+        other = shifted(base + step * (np.arange(count) == j))
+        if other is not None:
+            switched[:, j] = (other.stretch - shown) / step
 
 
 def gain_of(values: Mapping[str, float]) -> float:
