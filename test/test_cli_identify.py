@@ -14,6 +14,7 @@ from hmsa.cli import main
 from hmsa.errors import BadInputError
 from hmsa.identification.files import read_belief
 from hmsa.identification.measurement import read_csv
+from hmsa.model.simulation import ActuatorSimulation
 
 TIMES = np.arange(500) * 1e-3
 LEVELS = steps((1.1, 1.4, 1.0), 0.0444, 3)
@@ -85,6 +86,33 @@ def test_file_written_is_that_of_the_nodes_and_keeps_the_covariance(folder, caps
     for words in ('identified', 'shear_modulus', 'Autocorrelation', 'confounded'):
         assert words in page
     assert 'src="http' not in page
+
+
+@pytest.mark.parametrize('slew', [20.0, 8.0])
+def test_a_measured_field_that_ramps_is_not_limited_again(folder, capsys, slew):
+    plant = ActuatorSimulation(BLOCK, slew_limit=slew)
+    for time, level in zip(*LEVELS, strict=True):
+        plant.command(round(1e9 * time), level)
+    rows = []
+    for time in TIMES:
+        plant.advance(round(1e9 * time))
+        rows.append((time, plant.stretch, plant.flux_density))
+    noise = 1e-3 * np.random.default_rng(1).standard_normal(len(rows))
+    write('ramps.csv', 'time,stretch,flux_density', np.array(rows) + np.outer(noise, (0, 1, 0)))
+    write('steps.csv', 'time,stretch,flux_density', [
+        (x, y + z, LEVELS[1][np.searchsorted(LEVELS[0], x + 1e-9) - 1])
+        for (x, y, _), z in zip(rows, noise, strict=True)])
+    with open('slew.yaml', 'w', encoding='utf-8') as file:
+        file.write(
+            f'/**:\n  ros__parameters:\n    actuator.density: 1900.0\n    slew_limit: {slew}\n')
+    for name, count in (('ramps.csv', 1), ('steps.csv', 0)):
+        status, out, err = identify(capsys, name, '--params-file', 'slew.yaml', '--json')
+        assert status == 0, err
+        found = json.loads(out)
+        modulus = found['parameters']['shear_modulus']
+        assert modulus['low'] < BLOCK.shear_modulus < modulus['high']
+        assert found['noise_std'] < 1.2e-3
+        assert sum('already ramps' in x for x in found['warnings']) == count
 
 
 def test_what_is_not_identified_is_not_written_and_ends_with_1(folder, capsys):

@@ -52,6 +52,8 @@ _FEW_LEVELS = 8
 _MOST_SWITCHES, _SWITCHED = 300, 0.02
 # Difference of times, in s, above which clocks started at different times.
 _ANOTHER_CLOCK = 1e8
+# Median rate of a measured ramp, relative to the slew limit: jitter of the timestamps is less.
+_SAME_RATE = 1.1
 # Units of levels to test, and the improvement of the fit of the motion that shows another unit.
 _OTHER_UNITS = {1e3: 'ms', 1e6: 'us', 1e9: 'ns'}
 _BETTER = 0.5
@@ -428,9 +430,14 @@ def read_csv(
         times, levels = joined(time, stretch, times, levels, notes, (path, commands))
         earlier = 0.0
     else:
-        times, levels, earlier, used = _sampled_levels(
-            path, time, table.columns['flux_density'][keep], notes)
+        field = table.columns['flux_density'][keep]
+        times, levels, earlier, used = _sampled_levels(path, time, field, notes)
         time, stretch = time[:used], stretch[:used]
+        if slew_limit < math.inf and _ramps(time, field[:used], slew_limit):
+            notes.append(
+                f'the flux density already ramps at up to the slew limit of {slew_limit:g} T/s: '
+                'taken as measured behind the amplifier, and not limited again')
+            slew_limit = math.inf
     # Subtract the first time: seconds since an epoch leave few digits for differences.
     return Measurement(
         time - time[:1], stretch, times - time[:1], levels, slew_limit, earlier, str(path),
@@ -539,6 +546,18 @@ def _check_units(
                     f'levels from {times[0]:.6g} to {times[-1]:.6g} s: expected both in s, but '
                     f'the motion follows the levels as if the times of {wrong} were in {unit}; '
                     f'if they are, {remedy("time", unit, from_csv)}')
+
+
+def _ramps(time: Array, field: Array, slew: float) -> bool:
+    """
+    Return whether a sampled field ramps over several samples, at up to a slew rate in T/s.
+
+    Commanded levels step by more, or so rarely that no two changes follow each other.
+    """
+    rates = np.abs(np.diff(field) / np.diff(time))
+    moving = rates > 0.0
+    return bool(np.any(moving[1:] & moving[:-1])) and (
+        float(np.median(rates[moving])) <= _SAME_RATE * slew)
 
 
 def _sampled_levels(
