@@ -6,16 +6,41 @@ the time, the applied levels, the cut-offs and the samples.
 """
 
 from collections.abc import Callable, Sequence
+from typing import Protocol
 
+from hmsa.model.sensor import Sample
 from hmsa.model.units import NANOSECONDS
 from hmsa.planning.group import PlannerGroup
-from hmsa_ros.device.simulated import SimulatedDevice
 from hmsa_ros.device.watchdog import GuardedJoint
 from hmsa_ros.runtime.records import Environment, Output, Send, Settings
 from hmsa_ros.runtime.runtime import Runtime
 
 # Time to wait, in ns, while the controller waits for something.
 _PATIENCE = NANOSECONDS // 1000
+
+
+class LoopDevice(Protocol):
+    """What the loop needs of a device, as of `hmsa_ros.device.simulated.SimulatedDevice`."""
+
+    @property
+    def time(self) -> int:
+        """Time in ns that the device has been advanced to."""
+
+    @property
+    def next_sample(self) -> int:
+        """Time in ns to advance the device to next."""
+
+    def receive(self, joint: int, stamp: int, level: float) -> None:
+        """Accept a level in T from a timestamp in ns on."""
+
+    def advance(self, time: int) -> None:
+        """Do the work due up to a time in ns."""
+
+    def changes(self) -> Sequence[tuple[int, int, float]]:
+        """Return joint, time and level of what took effect since the last call."""
+
+    def samples(self) -> Sequence[Sample]:
+        """Return the samples since the last call."""
 
 
 class Loop:
@@ -28,7 +53,7 @@ class Loop:
         The planners, in the order of the device's joints.
     settings : Settings
         Settings of the controller.
-    device : SimulatedDevice
+    device : LoopDevice
         The device to command; its time is that of the loop.
     guards : sequence of GuardedJoint, optional
         The guards of its joints, if it rejects commands after a cut-off.
@@ -36,7 +61,7 @@ class Loop:
     """
 
     def __init__(
-            self, group: PlannerGroup, settings: Settings, device: SimulatedDevice,
+            self, group: PlannerGroup, settings: Settings, device: LoopDevice,
             guards: Sequence[GuardedJoint] = ()) -> None:
         self.now = device.time  #: in ns
         self.device, self._guards = device, guards
