@@ -271,8 +271,7 @@ class SimulatedBoard(SimulatedLine):
             self._truth.write('time,stretch,rate,flux_density\n')
         self.restart()
 
-    @staticmethod
-    def _make_block() -> Any:
+    def _make_block(self) -> Any:
         return ActuatorSimulation(paper_actuator(), time=0)
 
     def restart(self) -> None:
