@@ -57,7 +57,7 @@ class Rod:
 
     @cached_property
     def _bending(self) -> Array:
-        made: Array = 0.5 * ((np.arange(self.terms) + 0.5) * math.pi) ** 2
+        made: Array = 0.5 * ((np.arange(self.terms, dtype=np.float64) + 0.5) * math.pi) ** 2
         return made
 
     @cached_property
@@ -73,7 +73,7 @@ class Rod:
     def rest(self, load: float) -> Array:
         """Return the coefficients at rest under a load."""
         weights, _, sines = self._rule
-        shape = np.zeros(self.terms)
+        shape: Array = np.zeros(self.terms)
         for part in np.linspace(0.0, load, 2 + int(abs(load)))[1:]:
             for _ in range(_NEWTON):
                 turned = shape @ sines

@@ -104,8 +104,8 @@ def compare(*, quick: bool) -> Sheet:
     for ratio in _RATIOS[:1] if quick else _RATIOS:
         laboratory = _Laboratory(ratio)
         for start, target in _pairs(_ANGLES[:3] if quick else _ANGLES):
-            ends = [_of_degrees(x) for x in (start, target)]
-            mode, two, modal = (laboratory.moved(*ends, *x) for x in (
+            begin, end = _of_degrees(start), _of_degrees(target)
+            mode, two, modal = (laboratory.moved(begin, end, *x) for x in (
                 ('paper', 'two_step'), ('clamped', 'two_step'), ('clamped', 'modal')))
             time = modal.duration / two.duration
             passed = passed and _kept(modal, time)
@@ -131,9 +131,9 @@ def sequences(*, quick: bool, runs: int = RUNS) -> Sheet:
         for _ in range(1 if quick else runs):
             angles = _random(random, 2 if quick else _MOVES)
             for start, target in _pairs(angles):
-                ends = [_of_degrees(x) for x in (start, target)]
-                move = _Laboratory(ratio).moved(*ends, 'clamped', 'modal')
-                two = _Laboratory(ratio).move(*ends, 'clamped', 'two_step')
+                begin, end = _of_degrees(start), _of_degrees(target)
+                move = _Laboratory(ratio).moved(begin, end, 'clamped', 'modal')
+                two = _Laboratory(ratio).move(begin, end, 'clamped', 'two_step')
                 found.append(move)
                 times.append(move.duration / two.duration)
                 passed = passed and _kept(move, times[-1])

@@ -365,7 +365,7 @@ def advised(
 def identified(*, quick: bool) -> Sheet:
     """Return how modes are identified from recordings of finite elements."""
     seeds = 1 if quick else _SEEDS
-    rows, figures = [], []
+    rows, figures = [], list[dict[str, Any]]()
     for shape in [1.0] if quick else [*SHAPES]:
         paper, clean = recorded(shape)
         named, good, wrong, left, ratios = 0, 0, 0, list[float](), list[float]()
@@ -419,7 +419,7 @@ def covered(*, quick: bool) -> Sheet:
     rows, figures, passed = [], [], True
     for count in (1, 2):
         runs = 2 if quick else _OWN
-        good, inside, all_inside = 0, list[bool](), {}
+        good, inside, all_inside = 0, list[bool](), dict[str, list[bool]]()
         for seed in range(runs):
             known, true, recording = _drawn(count, seed)
             found = identify(

@@ -93,7 +93,7 @@ def compare(*, quick):
     sender = subprocess.Popen(
         [sys.executable, str(Path(__file__).resolve())], stderr=subprocess.DEVNULL)
     dice = random.Random(1)
-    losses, count, missing = [], 0, 0
+    losses, count, missing = list[float](), 0, 0
     recorders = []
     try:
         with tempfile.TemporaryDirectory() as folder:

@@ -20,6 +20,7 @@ import numpy as np
 from benchmarks.sheet import Sheet
 from hmsa.judge.judging import judge
 from hmsa.judge.records import RequestedSetpoint, Tolerances
+from hmsa.model.equations import Array
 
 #: Runs of each kind.
 RUNS = 200
@@ -146,7 +147,8 @@ def draw(seed: int, kind: str) -> Trial:
             shown = np.ptp(truth.vibrates(np.linspace(0.0, hold, 40 * _SAMPLES)))
             truth = replace(truth, second=0.5 * second**2 / float(shown))
     move = 0.6 * period
-    time = np.arange(-random.uniform(1.0, 2.0) * period - move, hold, interval)
+    time: Array = np.arange(
+        -random.uniform(1.0, 2.0) * period - move, hold, interval, dtype=np.float64)
     stamps = time
     if kind == 'dropouts':
         left = random.uniform(size=len(time)) > random.uniform(0.05, 0.7)

@@ -42,8 +42,9 @@ from hmsa_lab.bench.assembly import Assembly, CoilModel, fit_core, SensorScale
 from hmsa_lab.bench.calibration import calibrate_coil, decay, loop
 from hmsa_lab.bench.serial_board import REST_LENGTH, SimulatedBoard, TESLA_PER_AMPERE
 from hmsa_lab.experiments.tuning import chosen, excitation, identified, Tuning
+from hmsa_ros.device.coil import HardwareJoint
 from hmsa_ros.device.watchdog import Fallback
-from hmsa_ros.device.worker import HardwareDevice, HardwareJoint
+from hmsa_ros.device.worker import HardwareDevice
 from hmsa_ros.runtime.loop import Loop
 from hmsa_ros.runtime.records import Output, Settings, StatusChanged, Trajectory
 
@@ -189,7 +190,7 @@ class Driver:
         serial = type('Serial', (serial_board.Board,), {'simulate': lambda *_: board})
         # It waits for answers in simulated time too.
         for module in (line, serial_board):
-            module.monotonic = lambda: 1e-9 * board.now  # type: ignore[assignment]
+            vars(module)['monotonic'] = lambda: 1e-9 * board.now
         hardware = Assembly(
             serial('sim'), coil, SensorScale(rest_length=REST_LENGTH))
         self.device = HardwareDevice(
@@ -316,7 +317,8 @@ class Trial:
         segments = (self._segments or self._planned)[-len(targets):]
         first = self._first()
         self.targets = [
-            TargetWindow(x, hold * i, hold * (i + 1), 1e-9 * (y.arrival - first))
+            TargetWindow(x, hold * i, hold * (i + 1), (
+                None if y.arrival is None else 1e-9 * (y.arrival - first)))
             for i, (x, y) in enumerate(zip(targets, segments, strict=True))]
         return self._left([x.arrival or 0.0 for x in self.targets], [
             self.verdicts.get(i + 1, 'unobserved') for i in range(len(targets))])

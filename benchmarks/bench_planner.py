@@ -157,7 +157,7 @@ def _external(
 def _c_programs(
         directory: Path, reference: Reference, repeats: int, ours: float
 ) -> list[Contender]:
-    found = []
+    found: list[Contender] = []
     for limit in sorted({LIMIT, ours}, reverse=True):
         for name, options in (
                 ('C -O2, plainly written', []),
@@ -222,16 +222,15 @@ def compare(*, quick: bool = False) -> Sheet:
 def _summary(rows: list[Row]) -> list[str]:
     """Return the results of the batch function as sentences."""
     lines = []
-    batches = [x for x in rows if x.name.startswith('plan_two_step_batch')]
-    for one in (x for x in batches if x.name.endswith('1 thread')):
-        lines.append(f'batch, {one.setting}, 1 thread: {1.0 / one.least:,.0f} plans/s')
-        for row in batches:
-            if row.setting == one.setting and row is not one:
-                threads = int(row.name.split()[-2])
-                share = 100.0 * one.least / (threads * row.least)
+    batches = [(x.setting, int(x.name.split()[-2]), x.least) for x in rows
+               if x.name.startswith('plan_two_step_batch') and x.least is not None]
+    for setting, _, one in (x for x in batches if x[1] == 1):
+        lines.append(f'batch, {setting}, 1 thread: {1.0 / one:,.0f} plans/s')
+        for other, threads, least in batches:
+            if other == setting and threads > 1:
                 lines.append(
-                    f'batch, {row.setting}, {threads} threads: {1.0 / row.least:,.0f} plans/s, '
-                    f'{share:.0f} % of {threads} times one thread')
+                    f'batch, {setting}, {threads} threads: {1.0 / least:,.0f} plans/s, '
+                    f'{100.0 * one / (threads * least):.0f} % of {threads} times one thread')
     return lines
 
 

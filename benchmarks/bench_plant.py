@@ -122,7 +122,10 @@ def compare(*, quick: bool = False) -> Sheet:
             ('simulate', partial(_package, sequence)),
             ('SciPy solve_ivp, DOP853', partial(stepped, _scipy)),
             ('SciPy odeint, LSODA', partial(stepped, _odeint))):
-        tolerance = loosest(lambda x, run=run: error(run(x)), LIMIT)
+        def error_at(tolerance: float, run: Callable[[float], np.ndarray] = run) -> float:
+            return error(run(tolerance))
+
+        tolerance = loosest(error_at, LIMIT)
         entries.append(timed(name, f'tolerance {tolerance:.0e}', partial(run, tolerance)))
     entries.insert(1, timed(
         'simulate, as the plant node', f'rtol {RTOL:.0e}', partial(_package, sequence, RTOL)))

@@ -47,7 +47,7 @@ def receive():
     signal.signal(signal.SIGINT, lambda *_: ended.append(True))
     rclpy.init(signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
     node = rclpy.create_node('receiver', enable_rosout=False)
-    stamps = []
+    stamps: list[tuple[int, str]] = []
     capture = Capture(lambda taken: stamps.extend(
         (message.source_ns, message.data[4:].hex()) for _, messages in taken
         for message in messages))

@@ -19,7 +19,7 @@ import numpy as np
 from benchmarks.measure import Row, table
 from benchmarks.sheet import Sheet
 
-MODES = (
+MODES: tuple[tuple[str, dict[str, str]], ...] = (
     ('two_step', {}),
     ('robust', {'shaper': 'robust'}),
     ('minimum_time', {'shaper': 'minimum_time'}),

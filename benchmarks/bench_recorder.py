@@ -18,6 +18,7 @@ nothing. A rate therefore counts as too high only after several tries of some se
 with a loss is repeated; all runs are shown.
 """
 
+from collections.abc import Callable
 import json
 import os
 from pathlib import Path
@@ -98,26 +99,29 @@ def receive(kind, folder):
     rclpy.init(signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
     node = rclpy.create_node('receiver', enable_rosout=False)
     count = 0
+    callback: Callable[..., None]
     if kind == 'bare':
-        def callback(message):
+        def counted(message):
             nonlocal count
             count += 1
-        executor = EventsExecutor()
+
+        callback, executor = counted, EventsExecutor()
     else:
         from hmsa.bag.writer import BagTopic, BagWriter
         writer = BagWriter(folder)
-        number = writer.add_topic(BagTopic(TOPIC, 'std_msgs/msg/UInt8MultiArray'))
+        topic = writer.add_topic(BagTopic(TOPIC, 'std_msgs/msg/UInt8MultiArray'))
         flushed = time.monotonic()
 
-        def callback(message, info):
+        def written(message, info):
             nonlocal count, flushed
             count += 1
-            writer.write([(number, info['received_timestamp'], info['source_timestamp'], 0,
+            writer.write([(topic, info['received_timestamp'], info['source_timestamp'], 0,
                            message)])
             if time.monotonic() - flushed > 0.5:
                 writer.flush()
                 flushed = time.monotonic()
-        executor = SingleThreadedExecutor()
+
+        callback, executor = written, SingleThreadedExecutor()
     signal.signal(signal.SIGUSR1, lambda *_: report(count))
     node.create_subscription(UInt8MultiArray, TOPIC, callback, qos(), raw=True)
     executor.add_node(node)
@@ -146,12 +150,15 @@ class Source:
     def __init__(self):
         self.process = subprocess.Popen(
             role('source'), stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self._requests, self._answers = self.process.stdin, self.process.stdout
 
     def send(self, rate, seconds):
         """Send; return the number sent and the rate."""
-        self.process.stdin.write(f'{rate} {seconds}\n')
-        self.process.stdin.flush()
-        return json.loads(self.process.stdout.readline())
+        self._requests.write(f'{rate} {seconds}\n')
+        self._requests.flush()
+        return json.loads(self._answers.readline())
 
     def close(self):
         """End the process."""
@@ -165,6 +172,7 @@ def measure(command, rate, seconds, count):
     figures = sender.send(rate, seconds)
     time.sleep(1.0)
     receiver.send_signal(signal.SIGINT)
+    assert receiver.stdout is not None
     output = receiver.stdout.read()
     _, _, usage = os.wait4(receiver.pid, 0)
     receiver.returncode = 0
@@ -211,6 +219,8 @@ class Search:
         self._end = time.monotonic() + SEARCH_LIMIT_SECONDS
         self._receiver = subprocess.Popen(
             role('receive', 'bare', ''), stdout=subprocess.PIPE, text=True)
+        assert self._receiver.stdout is not None
+        self._counts = self._receiver.stdout
         self._source = Source()
         self._before = 0
 
@@ -257,7 +267,7 @@ class Search:
         for _ in range(50):
             time.sleep(0.1)
             self._receiver.send_signal(signal.SIGUSR1)
-            now = json.loads(self._receiver.stdout.readline())['received']
+            now = json.loads(self._counts.readline())['received']
             same = same + 1 if now == count else 0
             count = now
             if same >= 3:

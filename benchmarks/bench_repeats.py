@@ -104,7 +104,8 @@ def _left(
     plan = np.asarray(actuator.plan([(x, hold) for x in setpoints], shaper).levels)
     times, levels = plan[plan[:, 0] < hold * len(setpoints) * (1.0 - 1e-9)].T
     targets = [TargetWindow(x, i * hold, (i + 1) * hold) for i, x in enumerate(setpoints)]
-    samples = np.arange(0.0, hold * len(setpoints), period / _SAMPLES)
+    samples: Array = np.arange(
+        0.0, hold * len(setpoints), period / _SAMPLES, dtype=np.float64)
     played: list[Array] = []
     repeats: list[SequenceRepeat] = []
     for _ in range(REPEATS + 1):

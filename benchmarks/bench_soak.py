@@ -283,18 +283,18 @@ class Soak:
 
     # -- processes, time and memory ------------------------------------------------------------
 
-    def _start(self, name: str, alias: str = '', **more: object) -> None:
-        parameters: dict[str, object] = {
+    def _start(self, name: str, alias: str = '', /, **more: object) -> None:
+        own: dict[str, dict[str, object]] = {
             'plant': {'publish_clock': True, 'real_time_factor': self._factor,
                       'publish_rate': self._rate},
             'planner': {'use_sim_time': True, 'lead_time': self._lead,
                         'short_spell': 'continue'},
             'recorder': {'use_sim_time': True,
                          'record.topics': '[' + ', '.join(_TOPICS) + ']'},
-        }[name] | more
+        }
         alias = alias or name
         self._children[alias] = self.rig.start(
-            name, parameters, {'__node': alias} if alias != name else None)
+            name, own[name] | more, {'__node': alias} if alias != name else None)
         self._lives[alias] += 1
         self._born[alias] = self.seconds / _HOUR
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hmsa.model.equations import Array
 
@@ -147,9 +148,9 @@ class Block:
         frequencies, shares = frequencies[order], shares[order]
         groups = np.cumsum(np.append(0, np.diff(frequencies) > _TOGETHER * frequencies[1:]))
         first = np.searchsorted(groups, np.arange(groups[-1] + 1))
-        return frequencies[first], np.bincount(groups, shares)
+        return frequencies[first], np.asarray(np.bincount(groups, shares), np.float64)
 
-    def _stiffness(self, moves: Array) -> Any:
+    def _stiffness(self, moves: NDArray[np.intp]) -> Any:
         """Return the stiffness of the free displacements, as a sparse matrix."""
         from scipy.sparse import coo_array
 

@@ -45,7 +45,7 @@ def bound(bench: Bench, kinds: Sequence[str] = tuple(KINDS)) -> float:
     free = (*(y for x in kinds for y in _WIDTHS[x]), 'stretch_bias')
     begin, arrivals, levels = _planned(bench)
     second, end = arrivals[0] + _HOLD * bench.unit, arrivals[1] + _HOLD * bench.unit
-    times = np.arange(begin, end, bench.period)
+    times: Array = np.arange(begin, end, bench.period, dtype=np.float64)
     look = np.linspace(0.0, _LOOK * bench.unit, _TIMES)
     shown, judged = _derivatives(
         bench, free, levels, begin, times, np.concatenate([

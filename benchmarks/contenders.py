@@ -48,8 +48,8 @@ def with_scipy(actuator: Actuator, tolerance: float) -> Solver:
         def rate(_, state):
             return state[1]
 
-        rate.terminal = True
-        rate.direction = -1.0 if target > start else 1.0
+        # SciPy reads attributes of the function.
+        vars(rate).update(terminal=True, direction=-1.0 if target > start else 1.0)
 
         def miss(load: float) -> float:
             found = solve_ivp(

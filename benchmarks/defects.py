@@ -151,7 +151,7 @@ def motion(plants: Plants, switches: Array, levels: Array, end: float) -> Callab
 def sequence(plants: Plants, targets: tuple[float, ...] = _STEPS, repeats: int = _REPEATS,
              dwell: float = _DWELL) -> tuple[Array, Array, float]:
     """Return switches, loads and the end of unshaped steps to targets as the model holds them."""
-    held = [np.zeros(len(plants.damping))]
+    held: list[Array] = [np.zeros(len(plants.damping))]
     for target in targets * repeats:
         square = 2.0 / target + target ** 2 - 3.0
         held.append((target - target ** -2) / (1.0 - square / plants.limit))
@@ -176,9 +176,10 @@ def measured(place: int, given: Plants, seen: Callable[[int, Array], Array], swi
     block = given.block(place)
     unit = block.time_unit
     if at is None:
-        at = np.arange(0.05, end - 0.05, PERIOD / sensor.per_period)
-    noise = sensor.noise * random.standard_normal(len(at))
-    true = at
+        at = np.arange(
+            0.05, end - 0.05, PERIOD / sensor.per_period, dtype=np.float64)
+    noise: Array = sensor.noise * random.standard_normal(len(at))
+    true: Array = at
     if sensor.kind == 'jittered':
         true = np.clip(at + 0.002 * PERIOD * random.standard_normal(len(at)), 0.02, end - 0.03)
     if sensor.kind == 'coloured':

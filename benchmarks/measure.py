@@ -40,7 +40,7 @@ class Contender:
 def stopwatch(work: Callable[[], object], units: float, *, least: float = 0.1) -> Clock:
     """Return a clock of a function that does ``units`` of work, run for ``least`` s or more."""
     def clock() -> tuple[float, float]:
-        spans = []
+        spans: list[float] = []
         end = perf_counter() + least
         while not spans or perf_counter() < end:
             begin = perf_counter()

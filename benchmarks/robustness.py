@@ -21,7 +21,7 @@ from benchmarks.damped_sampled import (
 )
 from hmsa.errors import complain, HmsaError
 from hmsa.model.moves import State
-from hmsa.model.parameters import NondimensionalParameters
+from hmsa.model.parameters import Errors, NondimensionalParameters
 from hmsa.planning.shapers import SHAPERS
 from hmsa.planning.shapers.request import MoveRequest, SmoothLimits
 from hmsa.report.looks import SCREEN
@@ -32,7 +32,6 @@ from hmsa_studies.robustness import (
     Candidate,
     candidates,
     Case,
-    Errors,
     PARAMETERS,
     Result,
     study,

@@ -71,11 +71,13 @@ class _Bench:
     def _until(
             self, wait: Callable[..., None], condition: Callable[[], Any], what: str) -> None:
         """Wait; start the driver again if the host halted the board for longer than a call."""
-        while not (wait(lambda: condition() or not self.driver.alive, what) or condition()):
+        wait(lambda: condition() or not self.driver.alive, what)
+        while not condition():
             # The board may still answer the driver that has ended: not on a new line.
             self.board.plug()
             self.rig.applied.clear()
             self._start()
+            wait(lambda: condition() or not self.driver.alive, what)
 
     def beat_until(
             self, condition: Callable[[], Any], what: str, level: float = _LEVEL, *,

@@ -18,6 +18,11 @@ _SHARES = (0.01, 0.05, 0.1, 0.2)
 _SAME = 1e-9
 
 
+def _await_sample(rig: Rig) -> None:
+    mark = rig.count()
+    rig.spin_until(lambda: rig.count() > mark, 'samples of the plant')
+
+
 def _mismatch(rig: Rig, name: str) -> Seen:
     residuals = []
     worst = 0.0
@@ -26,8 +31,7 @@ def _mismatch(rig: Rig, name: str) -> Seen:
             paper_actuator(), **{name: getattr(paper_actuator(), name) * (1.0 + part)})
         plant = rig.start('plant', {f'actuator.{name}': getattr(truth, name)})
         planner = rig.start('planner')
-        mark = rig.count()
-        rig.spin_until(lambda mark=mark: rig.count() > mark, 'samples of the plant')
+        _await_sample(rig)
         rig.ready('plant', 'planner')
         mark, sent = rig.count(), len(rig.commands)
         rig.setpoint(1.2)
@@ -49,9 +53,9 @@ def _mismatch(rig: Rig, name: str) -> Seen:
 
 def _difference(
         truth: ActuatorParameters, stamps: np.ndarray, values: np.ndarray,
-        commands: list[tuple[int, float]], **coil: float) -> float:
+        commands: list[tuple[int, float]], *, lag: float = 0.0) -> float:
     """Return the maximum difference from the same commands, integrated here."""
-    simulation = ActuatorSimulation(truth, time=int(stamps[0]), **coil)
+    simulation = ActuatorSimulation(truth, time=int(stamps[0]), coil_time_constant=lag)
     simulation.set_state(*map(float, values[0]))
     for stamp, flux_density in commands:
         simulation.command(stamp, flux_density)
@@ -81,8 +85,7 @@ def _lag(rig: Rig) -> Seen:
     await_change(rig, mark)
     rig.let_pass(0.3)
     stamps, values = rig.samples(mark)
-    worst = _difference(
-        paper_actuator(), stamps, values, rig.commands[sent:], coil_time_constant=lag)
+    worst = _difference(paper_actuator(), stamps, values, rig.commands[sent:], lag=lag)
     # From the last substantial change on: the rest follows within microteslas.
     late = np.flatnonzero(np.abs(values[:, 2] - values[-1, 2]) > 1e-6)[-1]
     residual = float(np.ptp(values[late + 1:, 0])) / 0.2

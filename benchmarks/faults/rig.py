@@ -211,11 +211,10 @@ class Rig:
         # Messages sent before two nodes have discovered each other are lost. They have discovered
         # this node; two rounds of diagnostics later, at least a second, also each other. A relay
         # that starts on a busy machine discovers them later.
-        for child in self.children:
-            if child.log.stem == 'relay':
-                self.spin_until(
-                    lambda child=child: 'joined' in child.said,  # type: ignore[misc]
-                    'the relay to find planner and plant')
+        relays = [x for x in self.children if x.log.stem == 'relay']
+        self.spin_until(
+            lambda: all('joined' in x.said for x in relays),
+            'the relay to find planner and plant')
         self._await_diagnostics(names)
 
     def traces(self) -> list[str]:
@@ -300,10 +299,9 @@ class Rig:
     def _await_diagnostics(self, nodes: Sequence[str]) -> None:
         """Wait for two rounds of diagnostics: the first may already have been on its way."""
         ends = {x: self._rounds(x) + 2 for x in nodes}
-        for node, end in ends.items():
-            self.spin_until(
-                lambda node=node, end=end: self._rounds(node) >= end,  # type: ignore[misc]
-                f'diagnostics of {node}')
+        self.spin_until(
+            lambda: all(self._rounds(x) >= y for x, y in ends.items()),
+            f'diagnostics of {", ".join(nodes)}')
 
     # -- requests ------------------------------------------------------------------------------
 
