@@ -332,7 +332,8 @@ class Estimator:
         # Another jump during the same move is improbable.
         window.first = True
         window.settle(self._solution.z, _AT_REST)
-        self._window, until = window, self._seconds(stamp)
+        # Times of samples are rounded.
+        self._window, until = window, max([self._seconds(stamp), *window.time[-1:].tolist()])
         return window.solve(
             self._solution.z, self._as_levels(), window.scatter(self.noise), until), until
 
