@@ -476,7 +476,7 @@ class Estimator:
         fits = self.screening.fitting(
             window.stretch[new], here.residual[new], here.by[new], found.covariance, noise)
         if np.all(fits):
-            self._refused = []
+            self._refused = self._refused if self.screening.trouble else []
             return here
         self._refused = [*self._refused, *(
             (self._origin + round(float(window.time[i]) * NANOSECONDS), float(window.stretch[i]))
