@@ -14,6 +14,7 @@ from hmsa.judge.setpoint_samples import SetpointSamples
 from hmsa.model.equations import equilibrium_stretch
 from hmsa.model.units import NANOSECONDS
 from hmsa.offload import Awaited, Doing
+from hmsa.planning.lateness import LEAST_STEP
 from hmsa.planning.planner import Believed, Planner
 from hmsa.planning.timeline import JointModel, PlannedSegment, Timeline
 from hmsa_lab.adapt.estimator import Estimator, EstimatorOptions, StateEstimate
@@ -316,7 +317,7 @@ class AdaptiveJoint:
         if not trouble:
             self._fitted = max(self._fitted, estimator.newest)
         if found is not None and not trust.why:
-            self._look_at_vibration(plan, found)
+            self._look_at_arrival(plan, found)
         if found is not None and trust.why:
             found = replace(found, trusted=False, trouble=trust.why)
         self.latest, self.news = found, True
@@ -415,13 +416,12 @@ class AdaptiveJoint:
         confirmed = self.trust.confirmed
         return confirmed is not None and not same_parameters(confirmed, self.given)
 
-    def confirm(self, model: JointModel, left: float) -> None:
+    def _confirm(self, model: JointModel, found: StateEstimate, left: float) -> None:
         """Record the error of a move planned with a model, as a fraction of its step."""
         if self.sensor_changed:
             return
         self.trust.confirm(self.based(model), left)
-        found = self.acting
-        if found is not None and not self.trust.failed:
+        if self.acting is not None and not self.trust.failed:
             # That of confirmed parameters: what a force may hide of a bias does not count.
             place = found.free.index('stretch_bias')
             known = float(found.sure_of(self.prior.named).covariance[place, place])
@@ -441,8 +441,8 @@ class AdaptiveJoint:
         place = plan.under_way(time)
         return (plan.segments[place - 1] if place > 0 else plan.levels[0]).stretch
 
-    def _look_at_vibration(self, plan: Timeline, found: StateEstimate) -> None:
-        """Update the largest amplitude since the last arrival."""
+    def _look_at_arrival(self, plan: Timeline, found: StateEstimate) -> None:
+        """Update the largest amplitude since the last arrival, and confirm parameters at rest."""
         place = plan.under_way(found.time)
         segment = plan.segments[place] if place >= 0 else None
         if segment is None or segment.arrival is None or found.time < segment.arrival:
@@ -450,9 +450,14 @@ class AdaptiveJoint:
             return
         level = plan.level(found.time)
         at = held(found.values, found.stretch, level.flux_density)
-        if at is not None:
-            self.amplitude = max(self.amplitude, math.hypot(
-                found.stretch - at[0], found.rate / at[1]))
+        if at is None:
+            return
+        rings = math.hypot(found.stretch - at[0], found.rate / at[1])
+        self.amplitude = max(self.amplitude, rings)
+        if segment.path is None and found.time >= self.shown_from(segment) and math.isinf(
+                self.largest):
+            self._confirm(level.model, found, (rings + abs(at[0] - segment.stretch)) / max(
+                abs(segment.stretch - self.start(found.time)), LEAST_STEP))
 
     # -- initial states of plans ---------------------------------------------------------------
 

@@ -293,9 +293,8 @@ class Feedback(Follower):
         # Parameters as given cannot have made a move worse, whatever the temperature is by now.
         given = joint.without if joint.adapted(joint.based(model)) else (
             joint.given.at_temperature(model.temperature))
-        left, why = yield from error_of(hold, plan, given, joint.sensor)
+        why = yield from error_of(hold, plan, given, joint.sensor)
         if not why:
-            joint.confirm(model, left)
             return
         joint.trust.end(why)
         joint.news, joint.fresh = True, True

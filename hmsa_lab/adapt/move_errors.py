@@ -18,29 +18,26 @@ _STEP = 0.02
 
 def error_of(
         hold: SetpointSamples, plan: Timeline, given: JointModel, sensor: SensorModel
-) -> Awaited[tuple[float, str]]:
+) -> Awaited[str]:
     """
-    Return the error that a move leaves, as a fraction of its step, NaN if unknown.
+    Return why feedback made a move worse, empty if it did not.
 
-    Also return why feedback made it worse, empty if it did not: if a learnt level holds the
-    actuator, the open-loop error follows from it, because the given parameters predict the shift
-    of the equilibrium between the two levels accurately enough. ``plan`` is the plan in force.
+    If a learnt level holds the actuator, the open-loop error follows from that with feedback,
+    because the given parameters predict the shift of the equilibrium between the two levels
+    accurately enough. ``plan`` is the plan in force.
     """
     setpoint = hold.setpoint
-    if setpoint.step < _STEP:
-        return math.nan, ''
     arrival = setpoint.moved or hold.asked
+    level = plan.level(arrival)
+    if setpoint.step < _STEP or given.material.creep or plan.levels[-1] is not level:
+        return ''
     found = yield from hold.shown(replace(setpoint, arrival=arrival, moved=None), sensor=sensor)
     if not math.isfinite(found.offset):
-        return math.nan, ''
-    vibration = found.vibration if math.isfinite(found.vibration) else 0.0
-    left, level = (abs(found.offset) + vibration) / setpoint.step, plan.level(arrival)
-    if given.material.creep or plan.levels[-1] is not level:
-        return left, ''
+        return ''
     rest = float(equilibrium_stretch(given.load(level.flux_density), given.material))
     without = abs(found.offset - (rest - setpoint.target))
     if abs(found.offset) - without <= _WORSE * setpoint.step + _SURE * found.offset_std:
-        return left, ''
-    return left, (
+        return ''
+    return (
         f'{setpoint.where}: feedback has left {setpoint.words(abs(found.offset))} of '
         f'steady-state error, where open loop leaves {setpoint.words(without)}')
