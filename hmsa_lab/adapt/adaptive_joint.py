@@ -405,6 +405,13 @@ class AdaptiveJoint:
             self._restart(self.estimator.since)
         return False
 
+    def discard(self, now: int) -> None:
+        """Explain the samples with the given actuator: as confirmed, it makes moves worse."""
+        self.trust.recover(given=True)
+        self.trust.wait(now)
+        self._restart(self.estimator.since, healthy=True)
+        self.latest = None
+
     def _unlikely(self, values: Mapping[str, Any]) -> float:
         """Return the negative log probability of values before any sample, up to a constant."""
         off = self.prior.departures(coordinates(values, self.prior.free))

@@ -296,9 +296,13 @@ class Feedback(Follower):
         why = yield from error_of(hold, plan, given, joint.sensor)
         if not why:
             return
-        joint.trust.end(why)
-        joint.news, joint.fresh = True, True
+        joint.news = joint.fresh = True
         self._reverted.append(joint)
+        if joint.sensor_changed:
+            # It has not, since the figures of that sensor are allowed for.
+            joint.discard(self._clock())
+            return
+        joint.trust.end(why)
         self._report_ended(joint.words(self._clock()))
 
     def taken_back(self) -> list[AdaptiveJoint]:
