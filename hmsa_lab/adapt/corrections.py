@@ -122,7 +122,7 @@ class Corrections:
                     yield self._work(joint, self._rejoin)
                 continue
             estimate = joint.state(planner.soonest(now))
-            if estimate is None:
+            if estimate is None or joint.estimator.screening.doubts:
                 continue
             level = _trimmed(joint, estimate)
             if level is not None:

@@ -44,6 +44,11 @@ class Screening:
         # At rest: number of samples, of reversals, and of values equal to the previous one.
         self._resting = self._turns = self._same = 0
 
+    @property
+    def doubts(self) -> bool:
+        """Whether the newest samples do not fit; a single one may be an outlier."""
+        return self._in_a_row > 1
+
     def refuse_ahead(self, seconds: float) -> None:
         """Reject a sample whose timestamp is ahead of the clock by some seconds."""
         self.ahead += 1
