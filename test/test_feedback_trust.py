@@ -339,6 +339,35 @@ def test_a_modulus_that_jumps_in_a_hold_is_found_and_the_hold_corrected_at_once(
     assert max(x.size for x in left[laboratory.change.move:]) < 0.01
 
 
+def test_a_force_that_jumps_in_a_hold_is_not_taken_for_a_modulus():
+    # As a modulus, it would leave 2.1 % of the next step.
+    laboratory = drawn(93176, bench_harm.MOVES, changes=True)
+    left = bench_harm.run(laboratory, 'adapt')
+    assert max(x.size for x in left[laboratory.change.move:]) < 0.01
+
+
+def test_a_move_is_not_corrected_while_its_newest_samples_are_rejected():
+    # A force jumps. The first samples look like a coil lag; corrected for that, 15 % were left.
+    laboratory = drawn(93332, bench_harm.MOVES, changes=True)
+    left = bench_harm.run(replace(laboratory, targets=laboratory.targets[:4]), 'adapt')
+    assert left[-1].size < 0.08
+
+
+def test_a_corrected_move_confirms_parameters():
+    # The gain of the sensor changes after two corrected moves. With G as given, the next one would
+    # leave 66 %.
+    laboratory = drawn(93245, bench_harm.MOVES, changes=True)
+    left = bench_harm.run(replace(laboratory, targets=laboratory.targets[:3]), 'adapt')
+    assert left[-1].size < 0.01
+
+
+def test_feedback_does_not_end_with_a_modulus_that_was_confirmed_but_has_changed():
+    # With that, the second move leaves 15 %, and open loop then 23 % of the last one.
+    laboratory = drawn(93083, bench_harm.MOVES, changes=True)
+    left = bench_harm.run(replace(laboratory, targets=laboratory.targets[:4]), 'adapt')
+    assert left[-1].size < 0.01
+
+
 def test_a_bias_that_jumps_at_rest_before_the_first_move_is_not_taken_for_a_force():
     it = bench(False, noise=1e-3)
     it.sense = lambda time, x: [(time, x + 0.002)]

@@ -279,7 +279,7 @@ class AdaptiveJoint:
             self.estimator.unmeasured = now - stamp > self.settings.temperature_max_age
             self.estimator.warmed(celsius - self._thermometer)
             self._thermometer = celsius
-        self.estimator.modulus_may_jump = (
+        self.estimator.actuator_may_jump = (
             self.trust.acts and self.estimator.since > self.trust.begin)
         before = self.estimator.screening.lost
         estimator, found = yield from doing(_updated, self.estimator, now)
@@ -542,14 +542,14 @@ class AdaptiveJoint:
         # A plan with changed parameters begins from an unknown state, so moves are not
         # interrupted.
         return not self.chosen and bool(self.planner.plan.segments) and (
-            latest.time < self.waits or self._modulus_jumps(self._segment(latest.time))
+            latest.time < self.waits or self._actuator_jumps(self._segment(latest.time))
             or latest.time >= self.next_choice and self.shown(latest.time))
 
     def shown(self, time: int) -> bool:
         """Return whether samples until a time show how the joint has arrived."""
         segment = self._segment(time)
         return segment is not None and (
-            time >= self.shown_from(segment) or self._modulus_jumps(segment))
+            time >= self.shown_from(segment) or self._actuator_jumps(segment))
 
     def _segment(self, time: int) -> PlannedSegment | None:
         """Return the setpoint that a change of levels at a time would affect."""
@@ -557,10 +557,10 @@ class AdaptiveJoint:
         place = plan.under_way(self.planner.soonest(time))
         return plan.segments[place] if place >= 0 else None
 
-    def _modulus_jumps(self, segment: PlannedSegment | None) -> bool:
-        """Return whether the modulus has jumped since a setpoint that is no path began."""
+    def _actuator_jumps(self, segment: PlannedSegment | None) -> bool:
+        """Return whether the actuator has jumped since a setpoint that is no path began."""
         return segment is not None and segment.path is None and (
-            self.estimator.modulus_jump > segment.since)
+            self.estimator.actuator_jump > segment.since)
 
     def shown_from(self, segment: PlannedSegment) -> int:
         """Return the time from which samples show how the joint has arrived at a setpoint."""
@@ -574,7 +574,9 @@ class AdaptiveJoint:
             learnt = self.learnt(used)
             if segments[-1].path is not None:
                 learnt = as_of_path(learnt, used, latest)
-            better = partial(clearly_better, given=used == self.given, shown=not waits)
+            # Parameters as given are no longer after a jump.
+            better = partial(clearly_better, given=used == self.given and not (
+                self.estimator.actuator_jump), shown=not waits)
             if (yield from doing(
                     better, latest, learnt, used, self.start(latest.time),
                     segments[-1].stretch)):

@@ -36,7 +36,7 @@ from hmsa_lab.adapt.screening import Screening
 from hmsa_lab.adapt.window import (
     BiasCase,
     Jump,
-    MODULUS_JUMPS,
+    PART,
     Rest,
     Simulation,
     Solution,
@@ -70,9 +70,11 @@ _AT_REST, _ANYWHERE, _SETTLED = 2e-6, 0.3, 25.0
 _CALM = 12.0
 # Change of level, relative to the largest one, up to which it is a correction of a move.
 _CORRECTS = 0.1
-# Log odds from which the modulus, or the sensor before the first motion, has jumped, and maximum
+# Log odds from which the actuator, or the sensor before the first motion, has jumped, and maximum
 # number of samples in a row that do not fit and may show this.
 _JUMPED, _REFUSED = 6.0, 100
+# Acceleration by a jump of the modulus, with time in time scales.
+_PUSHED = 0.15
 # Maximum number of windows of samples that wait for an update.
 _WAITING = 10
 #: Standard deviations above which a suspected viscoelastic branch is used.
@@ -187,9 +189,9 @@ class Estimator:
         self.screening = Screening(self.options.gate, prior.coordinate)
         # If False, parameters stay fixed from the next update on.
         self.learning = self.options.learn
-        # Whether the modulus may jump: until a whole move has fitted, a mode that is missing looks
-        # like that.
-        self.modulus_may_jump = False
+        # Whether the actuator may jump: until a whole move has fitted, a missing mode looks like
+        # that.
+        self.actuator_may_jump = False
         self.unmeasured = True  # whether the temperature may change without a measurement
         self._levels: list[tuple[int, float]] = []
         self._origin = 0
@@ -214,7 +216,7 @@ class Estimator:
         self._fixed: Array | None = None
         self._warmed = 0.0  # change of the measured temperature in K since the window began
         self._refused: list[tuple[int, float]] = []  # samples that do not fit since others did
-        self.modulus_jump = 0  # time in ns of the last jump of the modulus
+        self.actuator_jump = 0  # time in ns of the last jump of the actuator
 
     @property
     def since(self) -> int:
@@ -311,21 +313,21 @@ class Estimator:
     def _with_jump(
             self, window: Window, found: Solution, levels: Levels, until: float
     ) -> tuple[Solution | None, float]:
-        """Return the solution after a jump of the modulus, if there was one, and its time in s."""
+        """Return the solution after a jump of the actuator, if any, and its time in s."""
         trouble = self.screening.trouble
-        if not self.modulus_may_jump or self._fixed is not None or (
+        if not self.actuator_may_jump or self._fixed is not None or (
                 'repeats' in trouble or not len(window.time)):
-            return replace(found, modulus=Jump()), until
+            return replace(found, actuator=Jump()), until
         refused = self._refused if trouble else []
         if refused:
             wider = window.wider([(self._seconds(x), y) for x, y in refused])
-            found = replace(found, modulus=wider.jump_of_modulus(
+            found = replace(found, actuator=wider.jump_of_actuator(
                 found.z, levels, wider.scatter(self.noise), until))
-        if found.modulus.odds <= _JUMPED:
+        if found.actuator.odds <= _JUMPED:
             return found, until
         stamp = self._origin + round(until * NANOSECONDS)
         self._solution, self._refused = found, []
-        self.modulus_jump = self._origin + round(found.modulus.time * NANOSECONDS)
+        self.actuator_jump = self._origin + round(found.actuator.time * NANOSECONDS)
         self.screening.restart()
         self._go_along(window, found, until)
         window = (self._window or window).wider([(self._seconds(x), y) for x, y in refused])
@@ -444,7 +446,8 @@ class Estimator:
         covariance[-2:, -2:] = np.diag(np.square([off, off * frequency]))
         window = Window(
             dict(prior.values), prior.free, np.append(mean, [stretch, 0.0]), covariance,
-            _bounds(self.prior), 0.0, np.zeros(0), np.zeros(0), hypotheses(
+            _bounds(self.prior), PART * self.prior.spread, 0.0, np.zeros(0), np.zeros(0),
+            hypotheses(
                 prior.free, prior.suspects, prior.named,
                 tuple(coordinates(self.prior.values, self.prior.free).tolist()),
                 tuple((1.0 / np.diag(self.prior.covariance)).tolist())),
@@ -530,9 +533,9 @@ class Estimator:
         span = _LONGEST * here.values['time_unit']
         # A whole move is fitted at once, since early in one linearisation would be inaccurate.
         before = int(np.searchsorted(window.time, self._seconds(self._move_begins(until))))
-        jumps = found.modulus.odds > _JUMPED
+        jumps = found.actuator.odds > _JUMPED
         if jumps:
-            place = min(int(np.searchsorted(window.time, found.modulus.time)), count - 1)
+            place = min(int(np.searchsorted(window.time, found.actuator.time)), count - 1)
         elif before > 1:
             place = before - 1
         elif count > self.options.window or (
@@ -547,18 +550,21 @@ class Estimator:
             return
         # After the last sample use the requested time.
         time = float(window.time[place]) if place < count else until
-        drift = np.zeros(len(window.mean))
+        drift, known = np.zeros(len(window.mean)), np.full(len(window.mean), math.inf)
         # Vibration decays to nothing, and an exact state has no covariance.
         drift[-2:] = _AT_REST ** 2, (_AT_REST / here.values['time_unit']) ** 2
         if self._fixed is None:
             drift[:-2] = self._drift(time - window.begin)
         if jumps:
-            drift[self.prior.free.index('shear_modulus')] += MODULUS_JUMPS ** 2
+            for i, gained in found.actuator.drift:
+                drift[i] += gained
+                # Before, it was as the likely suspects leave open.
+                known[i] = found.covariance[i, i]
             # It has moved since a time between two samples.
-            since = max(found.modulus.time, time) - float(window.time[max(place - 1, 0)])
+            since = max(found.actuator.time, time) - float(window.time[max(place - 1, 0)])
             unit = here.values['time_unit']
             drift[-2:] += np.square(
-                2.0 * MODULUS_JUMPS * since / unit * np.array([since / unit, 1.0 / unit]))
+                _PUSHED * since / unit * np.array([since / unit, 1.0 / unit]))
         follows = self._with_rest(here.values, time)
         wander, warming = follows @ np.diag(drift) @ follows.T, self._warming(follows)
         shift = round(time * NANOSECONDS)
@@ -568,7 +574,7 @@ class Estimator:
             self._origin, self._origin + shift, 0.0) and not (self._warmed or jumps) else None
         noise = window.scatter(self.noise)
         moved = window.move_on(
-            place, time, found.z, here, noise, wander, warming) if at is None else (
+            place, time, found.z, here, noise, wander, warming, known) if at is None else (
             window.rest_on(at, place, time, here, noise, wander))
         if self._warmed:
             moved.values = {**moved.values, WARMED: moved.values[WARMED] + self._warmed}

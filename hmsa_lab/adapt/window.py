@@ -39,8 +39,9 @@ _WEAK_MODES = 0.05
 # Standard deviations of a jump of bias and gain of the sensor, and its prior improbability as a
 # logarithm.
 _JUMPS, _RARELY = np.array([0.05, 0.1]), 3.0
-#: Standard deviation of a jump of the modulus, as a logarithm: half of that before any sample.
-MODULUS_JUMPS = 0.075
+#: Quantities that may jump beside those of the sensor, and by which part of their standard
+#: deviations before any sample.
+JUMPING, PART = ('shear_modulus', 'constant_force'), 0.5
 # Part of a change of the state up to which its effect on later motion is accurate (`motion`).
 _FADED = 1e-4
 # Maximum change per step of a coordinate that is a logarithm.
@@ -88,6 +89,7 @@ class Jump(NamedTuple):
 
     odds: float = -math.inf  # log odds
     time: float = 0.0  # in s from the origin of the window
+    drift: tuple[tuple[int, float], ...] = ()  # indices, and variances that they have gained
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +104,7 @@ class Solution:
     instead: Array
     doubt: BiasCase
     sensor: Jump = Jump()  # of bias and gain of the sensor, before or in the window
-    modulus: Jump = Jump()  # of the modulus in the window
+    actuator: Jump = Jump()  # of one of `JUMPING` in the window
     # Log odds that the sensor is not as before, if it may not be, relative to the possible ones
     # against that.
     changed: float = -math.inf
@@ -153,6 +155,7 @@ class Window:
     mean: Array  # of the prior, shape (q,)
     covariance: Array  # of the prior, shape (q, q)
     bounds: Array  # of the coordinates, shape (p, 2)
+    jumps: Array  # standard deviations of jumps of `JUMPING`, shape (p,)
     begin: float  # time of the estimated stretch and rate
     time: Array  # of the samples, not before the begin
     stretch: Array
@@ -165,7 +168,7 @@ class Window:
     first: bool = True
     # As in `Solution`, when the suspects were weighed.
     sensor: Jump = Jump()
-    modulus: Jump = Jump()
+    actuator: Jump = Jump()
     changed: float = -math.inf
     before: SensorBefore | None = None  # of a sensor that may have changed
     known: tuple[int, ...] = field(init=False)  # suspects estimated in earlier windows
@@ -279,7 +282,7 @@ class Window:
         return Solution(
             found.z, found.here, sure * inverse(found.matrix, found.loose) + square,
             np.broadcast_to(off, z.shape), np.broadcast_to(instead, z.shape), doubt, self.sensor,
-            self.modulus, self.changed, poor)
+            self.actuator, self.changed, poor)
 
     def _doubt(self, found: Optimum) -> BiasCase:
         """Return the expectation if a constant force and a gain may be in error, too."""
@@ -298,14 +301,14 @@ class Window:
             found.stretch = np.insert(self.stretch, place, stretch)
         return found
 
-    def jump_of_modulus(self, z: Array, levels: Levels, noise: float, until: float) -> Jump:
-        """Return the jump of the modulus at coordinates."""
+    def jump_of_actuator(self, z: Array, levels: Levels, noise: float, until: float) -> Jump:
+        """Return the jump of the actuator at coordinates."""
         here = self.simulate(z, levels, noise, until)
         if here is None:
             return Jump()
         self._look_for_jumps(Optimum(
             z, here, *self._slopes(z, here, noise), np.ones(len(z), dtype=np.bool_)), noise)
-        return self.modulus
+        return self.actuator
 
     def _slopes(self, z: Array, here: Simulation, noise: float) -> tuple[Array, Array]:
         """Return second derivatives of the cost, and the negative first ones."""
@@ -315,13 +318,13 @@ class Window:
 
     def _look_for_jumps(self, found: Optimum, noise: float) -> None:
         """
-        Weigh that bias and gain of the sensor jumped, or the modulus.
+        Weigh that bias and gain of the sensor jumped, or one quantity of the actuator.
 
         They jumped before the window, or at one of its samples, all of which are as probable. The
         rival is that all is as in earlier windows, or as their samples leave open. Before the
         first motion, a sensor may have jumped at a sample at rest.
         """
-        self.sensor, self.modulus = Jump(), Jump()
+        self.sensor, self.actuator = Jump(), Jump()
         if len(self.time) <= self.first or self.first and (
                 self.rest is None or TEMPERATURE in self.free):
             return
@@ -333,11 +336,17 @@ class Window:
         self.sensor = self._best_jump(found, rival, self._sums(
             here, noise, np.column_stack([np.ones(len(shown)), shown])), _JUMPS, none)
         # A block that warms changes in the course of time, and weak modes look like a change.
-        if not (self.first or self.modal or TEMPERATURE in self.free) and (
-                'shear_modulus' in self.free):
-            self.modulus = self._best_jump(
-                found, rival, self._sums_of_modulus(here, noise), np.array([MODULUS_JUMPS]),
-                none + max(self.sensor.odds, 0.0))
+        if self.first or self.modal or TEMPERATURE in self.free:
+            return
+        places = [i for i, x in enumerate(self.free) if x in JUMPING]
+        jumps = [
+            self._best_jump(found, rival, self._sums_of_actuator(here, noise, i), self.jumps[[i]],
+                            none + max(self.sensor.odds, 0.0)) for i in places]
+        if jumps:
+            best = max(jumps)
+            likely = np.exp([x.odds - best.odds for x in jumps])
+            gained = likely / np.sum(likely) * self.jumps[places] ** 2
+            self.actuator = best._replace(drift=tuple(zip(places, gained.tolist(), strict=True)))
 
     def _sums(self, here: Simulation, noise: float, jump: Array) -> tuple[Array, Array, Array]:
         """Return derivatives of the cost by m quantities that add to later readings."""
@@ -347,10 +356,10 @@ class Window:
             here.residual[:, None] * weighted))
         return across, square, pull
 
-    def _sums_of_modulus(self, here: Simulation, noise: float) -> tuple[Array, Array, Array]:
-        """Return as `_sums` for a modulus that differs from a sample on."""
+    def _sums_of_actuator(
+            self, here: Simulation, noise: float, place: int) -> tuple[Array, Array, Array]:
+        """Return as `_sums` for a quantity of the actuator that differs from a sample on."""
         motion, count = here.motion, len(self.time)
-        place = self.free.index('shear_modulus')
         state = np.stack([motion.by[:count], motion.rate_by[:count]], axis=1)
         size = np.linalg.norm(state[:, :, -2:], axis=(1, 2))
         state = state[:int(np.argmin(np.append(size, 0.0) > _FADED * size[0]))]
@@ -518,9 +527,11 @@ class Window:
 
     def move_on(
             self, count: int, begin: float, z: Array, here: Simulation, noise: float,
-            drift: Array, warming: Array) -> 'Window':
+            drift: Array, warming: Array, known: Array) -> 'Window':
         """
         Return the window without the first samples, which become part of the prior.
+
+        ``known`` is the variance of each coordinate at most, shape (q,).
 
         It begins at the next sample, or at the requested time. In between, coordinates change by
         the matrix ``warming``, and gain the covariance ``drift``, both of shape (q, q).
@@ -528,13 +539,16 @@ class Window:
         matrix, gradient = self._slopes(z, here._replace(
             residual=here.residual[:count], by=here.by[:count], weights=here.weights[:count]),
             noise)
-        covariance = inverse(matrix, np.ones(len(z), dtype=np.bool_))
+        every = np.ones(len(z), dtype=np.bool_)
+        matrix[np.diag_indices_from(matrix)] += np.maximum(
+            1.0 / known - 1.0 / np.diag(inverse(matrix, every)), 0.0)
+        covariance = inverse(matrix, every)
         change = warming @ transport(here.motion, count)
         there = np.append(z[:-2], [here.motion.stretch[count], here.motion.rate[count]])
         there = warming @ there + change @ (covariance @ gradient)
         covariance = change @ covariance @ change.T + drift
         return Window(
             self.values, self.free, there,
-            0.5 * (covariance + covariance.T), self.bounds, begin,
+            0.5 * (covariance + covariance.T), self.bounds, self.jumps, begin,
             self.time[count:], self.stretch[count:], self.suspects, self.suspected, first=False,
             before=self.before)
