@@ -626,6 +626,7 @@ def test_a_saturated_amplifier_is_neither_learnt_from_nor_asked_for_more(shown):
     if not shown:
         return
     assert asked <= 1.01 * wanted
+    assert f'the coil has 60 mT where {1e3 * wanted:.3g} mT were commanded' in it.message
     assert it.planner.model.actuator.shear_modulus == 1e4
 
 
@@ -643,8 +644,10 @@ def test_a_field_measured_before_or_after_the_stretch_is_no_fault_of_the_coil(la
     it = bench(factors={'shear_modulus': 0.8}, report=False)
     it.effort = lambda: field_of(it, it.now + (later - 2) * MS)
     left = np.abs(moves(it))
-    assert it.estimates[-1].values['new_beginnings'] == 0
+    values = it.estimates[-1].values
+    assert values['new_beginnings'] == 0
     assert np.max(left[2:]) < 0.1
+    assert float(values['field_mismatch_ms']) == pytest.approx(4 if later > 0 else 0, abs=3)
 
 
 def test_nothing_is_learnt_while_the_field_is_not_reported_any_more():
@@ -656,4 +659,5 @@ def test_nothing_is_learnt_while_the_field_is_not_reported_any_more():
     it.plant.command(it.now, 0.0)
     it.plant.limit = 0.0
     it.move(1.1, 400 * MS)
+    assert 'the field is no longer reported' in it.message
     assert it.planner.model.actuator.shear_modulus == pytest.approx(1e4, rel=2e-3)

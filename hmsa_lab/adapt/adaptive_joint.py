@@ -12,7 +12,7 @@ from hmsa.identification.quantities import coordinates, Known, TEMPERATURE, THER
 from hmsa.judge.records import SensorModel
 from hmsa.judge.setpoint_samples import SetpointSamples
 from hmsa.model.equations import equilibrium_stretch
-from hmsa.model.units import NANOSECONDS
+from hmsa.model.units import flux_text, NANOSECONDS
 from hmsa.offload import Awaited, Doing
 from hmsa.planning.lateness import LEAST_STEP
 from hmsa.planning.planner import Believed, Planner
@@ -53,6 +53,10 @@ _DENSE, _CROWDED, _SPARSE, _BURST = 40, 16, 10, 10
 _CHOICE = 3.0
 # Time scales after an arrival that show whether it succeeded.
 _LOOK = 3.0
+# Tolerance of the measured field: this fraction of its value or of the unit of load, and this many
+# time scales and coil time constants, after a change or in all. A field that is measured some ms
+# before or after the stretch differs for that long at each change of level.
+_OFF, _LEAST, _FOLLOWED = 0.05, 0.01, 3.0
 # Log odds from which the sensor counts as changed, and part of the possible log odds against a
 # change from which it counts as before; a drift of 1e-2 a second reaches 0.67.
 _JUMPED, _AS_BEFORE = 2.0, 0.7
@@ -107,6 +111,7 @@ class AdaptiveJoint:
         default_factory=list)  # setpoints to be audited after an update
     ready: int = 0  # number of audits to do now
     auditing: Iterator[None] | None = None  # the audit under way
+    lost: str = ''  # why the field is not as commanded; empty if it is
     largest: float = math.inf  # level in T at which the amplifier saturated
     _took_effect: tuple[int, int] = 0, 0  # timestamps of the last two applied levels
     news: bool = False  # whether the latest estimate awaits comparison with the plan
@@ -120,10 +125,13 @@ class AdaptiveJoint:
     # Explanations of these samples that have been tried: whether the sensor has changed.
     _tried: set[bool] = field(default_factory=set)
     _sensor: tuple[StateEstimate, SensorModel] | None = None  # estimate, and its sensor
+    _measured: bool = False  # whether the field is measured
     _thermometer: float = field(init=False)  # the newest measured temperature in use
+    differs_since: int | None = None  # timestamp since which the field differs; None if not
     sensor_changed: bool = False  # whether the estimator allows for any bias and gain
     reverts: bool = False  # whether the plan is to be reverted to the given parameters
     _bias: tuple[float, float] = 0.0, 0.0  # of the sensor as confirmed, and its deviation
+    mismatch: int = 0  # longest time in ns for which it differed, and then not any more
 
     def __post_init__(self, begun: int) -> None:
         given, settings = self.given, self.settings
@@ -187,7 +195,7 @@ class AdaptiveJoint:
     @property
     def doubted(self) -> bool:
         """Whether samples may be wrong, so that plans begin from the prediction."""
-        return self.adapts and bool(self.trust.why or self.sensor_changed)
+        return self.adapts and not self.lost and bool(self.trust.why or self.sensor_changed)
 
     # -- samples -------------------------------------------------------------------------------
 
@@ -213,15 +221,21 @@ class AdaptiveJoint:
         """Return whether a timestamp is far enough from the previous sample's."""
         return not self.newest <= stamp < self.next_sample
 
-    def add(self, stamp: int, stretch: float, now: int) -> None:
+    def add(self, stamp: int, stretch: float, flux_density: float, now: int) -> None:
         """
-        Add a stretch measured at a timestamp, which arrives at a time.
+        Add stretch and field in T measured at a timestamp, which arrive at a time.
 
         Samples may arrive in any order.
         """
         if not self.wants(stamp):
             return
-        sample = stamp, stretch, now
+        lost = self.lost = self._off(stamp, flux_density)
+        if lost and self.trust.why != lost and self.trust.doubt(lost, now, at_once=True):
+            # The estimate is discarded, and the update under way ends.
+            self._restart(stamp + 1)
+            self.latest, self.news = None, True
+            self.looked()
+        sample = stamp, math.nan if lost else stretch, now
         self.fresh, self.stamped_ahead = True, self._is_ahead(stamp, now)
         if not self.stamped_ahead:
             self.newest = max(self.newest, min(stamp, now))
@@ -257,6 +271,31 @@ class AdaptiveJoint:
         if wanted and 0.0 < flux_density / wanted < 1.0 - _ROUNDED and not any(
                 math.isclose(flux_density, x, rel_tol=_ROUNDED) for x in early):
             self.largest = abs(flux_density)
+
+    def _off(self, stamp: int, field: float) -> str:
+        """Return why the field differs from the commanded one for too long; empty if not."""
+        plan = self.planner.plan
+        level = plan.level(stamp)
+        wanted, options, units = level.flux_density, level.model.options, level.model.units
+        ramp = abs(wanted - level.in_force) / options.slew_limit
+        follows = round(NANOSECONDS * (
+            _FOLLOWED * (units.time + options.coil_time_constant) + ramp))
+        known = not math.isnan(field)
+        self._measured |= known
+        if not plan.segments or not self._measured or stamp < level.stamp + follows and known or (
+                abs(field - wanted) <= max(
+                    _OFF * max(abs(field), abs(wanted)), _LEAST * units.load)):
+            if self.differs_since is not None and not self.lost:
+                self.mismatch = max(self.mismatch, stamp - self.differs_since)
+            self.differs_since = None
+            return ''
+        if self.differs_since is None:
+            self.differs_since = stamp
+        if stamp < self.differs_since + follows:
+            return self.lost
+        return (
+            f'the coil has {flux_text(field)} where {flux_text(wanted)} were commanded'
+            if known else 'the field is no longer reported, and may differ from the command')
 
     # -- looks at them -------------------------------------------------------------------------
 
@@ -638,6 +677,7 @@ class AdaptiveJoint:
             'rejected': screening.rejected, 'frozen': screening.frozen,
             'unreadable': screening.unreadable, 'repeated': screening.repeated,
             'too_late': screening.late, 'ahead_of_clock': screening.ahead,
+            'field_mismatch_ms': f'{self.mismatch / 1e6:.3g}',
             'new_beginnings': self.trust.beginnings, 'ended': self.trust.ended,
             **self.sensor.to_dict()}
 

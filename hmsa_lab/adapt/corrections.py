@@ -115,7 +115,7 @@ class Corrections:
             yield self._work(joint, _take_back)
         for joint in self._feedback.news():
             planner = joint.planner
-            if not planner.plan.segments or planner.foreign:
+            if not planner.plan.segments or planner.foreign or joint.differs_since is not None:
                 continue
             if planner.as_sent(planner.soonest(now)):
                 if _leaves_path(joint, now):

@@ -142,8 +142,8 @@ class Feedback(Follower):
     def observed(self, joint: str, samples: Samples) -> None:
         """Process samples of a joint."""
         if joint in self.joints:
-            for stamp, stretch, _, _, came in zip(*samples, strict=True):
-                self.joints[joint].add(stamp, stretch, came)
+            for stamp, stretch, _, flux_density, came in zip(*samples, strict=True):
+                self.joints[joint].add(stamp, stretch, flux_density, came)
 
     def applied(self, joint: str, stamp: int, flux_density: float) -> None:
         """Record that a level in T has taken effect, before the plan does."""
@@ -284,9 +284,9 @@ class Feedback(Follower):
 
     def _audit(self, joint: AdaptiveJoint, hold: SetpointSamples) -> Awaited[None]:
         """Decide by the samples of a setpoint whether feedback ends."""
-        if joint.trust.ended or joint.trust.why or (
+        if joint.lost or joint.trust.ended or joint.trust.why or (
                 joint.estimator.screening.trouble or math.isfinite(joint.largest)):
-            # With a failing sensor or a saturated amplifier, the move shows nothing.
+            # With a failing sensor or another field, nothing can be concluded about the move.
             return
         plan = joint.planner.plan
         model = plan.levels[-1].model

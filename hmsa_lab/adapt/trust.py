@@ -45,7 +45,8 @@ class Trust:
         self._failed = False  # whether an estimate that fitted has failed later
 
     def doubt(
-            self, why: str, now: int, *, used: bool, fitted: bool) -> bool:
+            self, why: str, now: int, *, used: bool = True, fitted: bool = False,
+            at_once: bool = False) -> bool:
         """
         Record that samples do not fit at a time in ns; return whether to restart.
 
@@ -53,7 +54,7 @@ class Trust:
         """
         self._doubts += 1
         self._since = self._since if self._doubts > 1 else now
-        persists = self._doubts >= _PERSISTENT and (
+        persists = at_once or self._doubts >= _PERSISTENT and (
             now - self._since >= _LASTING * self._unit * NANOSECONDS)
         if persists or not self.ended:
             self.why = why
