@@ -152,6 +152,22 @@ def test_repeats_bring_two_modes_to_rest_and_return_to_the_best_one():
         trials[found[-1].best].at(found[-1].level_times + 1e-6), abs=1e-12)
 
 
+def test_a_first_mode_slower_than_planned_is_no_delay_and_no_second_mode():
+    block = Actuator(damping_ratio=0.05, chain_limit=5.0)
+    real = replace(block.block, mass_factor=2.4)
+    hold, unit = 8.0 * real.period, real.time_unit
+    plan = np.asarray(block.plan([(1.1, hold)]).levels)
+    times, levels = plan[plan[:, 0] < hold - 1e-9].T
+    samples, random = np.arange(0.0, hold, real.period / 20.0), np.random.default_rng(3)
+    seen = simulate(
+        np.append(-1.0, times / unit), np.append(0.0, real.units.of_level(levels)),
+        samples / unit, real.nondimensional)[0] + 1e-4 * random.standard_normal(len(samples))
+    found = learn([SequenceRepeat(samples, seen, times, levels)], [TargetWindow(1.1, 0.0, hold)],
+                  block.block, (-0.5, 0.5))
+    assert math.isnan(found.frequency)
+    assert found.rests[0] < real.period
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(('shape', 'damping', 'stretches', 'most'), [
     (1.0, 0.08, (1.1, 1.0), 0.01), (0.9, 0.03, (0.92, 1.2), 0.02)])

@@ -238,12 +238,21 @@ class _Sequence:
         return found
 
     def delay(self, trial: SequenceRepeat) -> float:
-        """Return the delay of the samples after the model in s, due to lag and latency."""
-        seen, shown = trial.stretch, self.simulated(self.levels(trial), trial.time)
+        """
+        Return the delay of the samples after the model in s, due to lag and latency.
+
+        A slower first mode looks like a delay, so that its frequency is varied, too.
+        """
+        seen, levels, actuator = trial.stretch, self.levels(trial), self.actuator
         delays = float(np.min(self.period)) * _DELAYS
-        off = [float(np.sum((seen - np.interp(trial.time - x, trial.time, shown))**2))
-               for x in delays]
-        return float(delays[np.argmin(off)])
+        found = []
+        for x in (1.0, *_FIRSTS):
+            shown = self.simulated(levels, trial.time, replace(
+                actuator, mass_factor=actuator.mass_factor / x**2))
+            found += [(float(np.sum((seen - np.interp(trial.time - y, trial.time, shown))**2)), y)
+                      for y in delays.tolist()]
+        delay: float = min(found)[1]
+        return delay
 
     def changes(self, index: int) -> tuple[Array, Array]:
         """Return times of levels of a move, and their changes by all levels, shape (n, m)."""
