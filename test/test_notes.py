@@ -67,8 +67,8 @@ def test_a_section_for_another_node_is_not_used_and_said(here, capsys):
         assert quick(capsys.readouterr().err) == (
             "hmsa: note: it.yaml: its section '/planr' is not used: expected /**, planner, plant "
             'or driver, the nodes that read parameters of an actuator\n'
-            'hmsa: note: it.yaml: its section plant alone sets actuator.half_length: plans use the '
-            'parameters of planner or of all nodes (/**), or else the defaults\n')
+            'hmsa: note: it.yaml: its section plant alone sets actuator.half_length: plans use '
+            'the parameters of planner or of all nodes (/**), or else the defaults\n')
     with pytest.warns(AssumedWarning, match='/planr'):
         belief = read_belief(here / 'it.yaml')
     assert (belief.actuator.remanence, belief.actuator.half_length) == (0.11, 0.02)
