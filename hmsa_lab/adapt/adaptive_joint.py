@@ -142,7 +142,7 @@ class AdaptiveJoint:
             self.prior.covariance[place, place]) if place >= 0 else 0.0
         self.estimator = Estimator(self.prior, EstimatorOptions(
             slew_limit=given.options.slew_limit, learn=not settings.feedback_frozen))
-        self.trust = Trust(begun, self.unit)
+        self.trust = Trust(begun)
 
     @property
     def _known(self) -> Known:

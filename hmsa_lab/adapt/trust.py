@@ -4,9 +4,8 @@ from hmsa.model.units import NANOSECONDS
 from hmsa.planning.timeline import JointModel, Timeline
 from hmsa_lab.adapt.estimator import Estimator
 
-# Number of successive updates with samples that do not fit until the estimator restarts, and the
-# time scales from the first of them: those of three updates of a fast actuator.
-_PERSISTENT, _LASTING = 3, 0.9
+# Number of successive updates with samples that do not fit until the estimator restarts.
+_PERSISTENT = 3
 # Time scales of motion, and samples of it, that must fit before an estimate is used.
 _SHOWN, _FEWEST = 6.0, 10
 # The same of a move slowed down to be corrected: a natural period. The first half of one of a
@@ -28,8 +27,7 @@ class Trust:
     `failed` then asks for an estimate with a sensor that may have changed.
     """
 
-    def __init__(self, begin: int, unit: float) -> None:
-        """Begin at a time in ns, with a time scale in s."""
+    def __init__(self, begin: int) -> None:
         # Model of the last move that arrived, as measured.
         self.confirmed: JointModel | None = None
         self.beginnings = 0  # number of restarts
@@ -41,7 +39,7 @@ class Trust:
         self.ended = False  # whether learnt parameters made moves worse
         # Time in ns from which a move has to fit, or from which the estimate has been used.
         self.begin = begin
-        self._doubts, self._since, self._unit = 0, begin, unit
+        self._doubts = 0
         self._failed = False  # whether an estimate that fitted has failed later
 
     def doubt(
@@ -53,9 +51,7 @@ class Trust:
         An estimate that earlier samples ``fitted`` has failed, or one that plans ``used``.
         """
         self._doubts += 1
-        self._since = self._since if self._doubts > 1 else now
-        persists = at_once or self._doubts >= _PERSISTENT and (
-            now - self._since >= _LASTING * self._unit * NANOSECONDS)
+        persists = at_once or self._doubts >= _PERSISTENT
         if persists or not self.ended:
             self.why = why
         # The first samples of a motion, which are few, may not fit yet.
